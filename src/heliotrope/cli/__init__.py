@@ -94,7 +94,7 @@ app.command()(demo)
 
 
 def main() -> None:
-    """Run the command line; bad input ends with one line on standard error and exit code 2."""
+    """Run the command line; invalid input ends with one line on standard error and exit code 2."""
     try:
         sys.exit(app(prog_name="heliotrope", standalone_mode=False) or 0)
     except TyperException as error:
@@ -118,7 +118,7 @@ def main() -> None:
         print("heliotrope: interrupted", file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:
-        # The reader of our output has closed it, as `head` does.
+        # The program that reads our output, such as `head`, has closed it.
         sys.stderr.close()
         sys.exit(141)
     except OSError as error:

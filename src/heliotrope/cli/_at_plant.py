@@ -1,4 +1,4 @@
-"""`heliotrope ctl` at the plant itself: the API's requests over the local interface.
+"""`heliotrope ctl` at the plant itself: API requests over the local interface.
 
 No console is needed. EMERGENCY, DEFOCUS and STOW use a separate socket of the plant, even without a
 valid token. No heavy library is imported, so that an emergency starts at once.
@@ -31,8 +31,8 @@ class AtPlant:
     Parameters
     ----------
     token
-        API token; "": none. The plant's own user and root need none to see the plant and to order
-        EMERGENCY, DEFOCUS and STOW.
+        API token; "" for no token. The plant's own user and root need no token to see the plant and
+        to order EMERGENCY, DEFOCUS and STOW.
     data
         Data folder of the plant.
     """
@@ -53,12 +53,12 @@ class AtPlant:
         """Do nothing, because each call has its own connection."""
 
     def ask(self, method: str, path: str, body: dict[str, Any] | None = None) -> Any:
-        """Send an API request; return the reply.
+        """Send an API request and return the reply.
 
         Raises
         ------
         HeliotropeError
-            If the plant refuses it, or cannot be reached.
+            If the plant refuses the request, or cannot be reached.
         """
         request, arguments, blob = f"{method} {path}", dict(body or {}), b""
         if request == "POST aim":
@@ -76,9 +76,9 @@ class AtPlant:
             return ask_once(self._folder / EMERGENCY, _USER, request, arguments)
 
     def get(self, path: str) -> Any:
-        """Return the view for a path."""
+        """Return the view at a path."""
         return self.ask("GET", path)
 
     def picture(self, path: str) -> bytes:
-        """Return the JPEG for a path."""
+        """Return the JPEG at a path."""
         return fetch_once(self._folder / ORDINARY, self._hello, f"GET {path}", {})[1]

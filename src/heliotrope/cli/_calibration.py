@@ -59,7 +59,7 @@ SchedulerOption = Annotated[
 
 
 def parse_priors(texts: list[str]) -> dict[str, float]:
-    """Return standard deviations by parameter from texts NAME=VALUE (rad, m or 1)."""
+    """Return standard deviations by parameter from texts "NAME=VALUE" (rad, m or 1)."""
     priors = {}
     for text in texts:
         name, _, value = text.partition("=")
@@ -72,13 +72,13 @@ def parse_priors(texts: list[str]) -> dict[str, float]:
 
 
 def parse_model(text: str) -> str | tuple[str, ...]:
-    """Return the name of a model, or the parameters of a list "tilt_north,canting,…"."""
+    """Return the name of a model, or the parameters in a list such as "tilt_north,canting"."""
     return tuple(p.strip() for p in text.split(",") if p.strip()) if "," in text else text
 
 
 @contextmanager
 def progress_of_steps(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Yield a function (step, done, total) that draws a bar on the terminal's error stream."""
+    """Yield a function (step, done, total) that draws a progress bar on standard error."""
     from rich.console import Console
     from rich.progress import Progress as Bar
 
@@ -92,7 +92,7 @@ def progress_of_steps(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
 
 @contextmanager
 def progress(label: str, quiet: bool) -> "Iterator[Progress]":
-    """Yield a function (done, total) that draws a bar on the terminal's error stream."""
+    """Yield a function (done, total) that draws a progress bar on standard error."""
     with progress_of_steps(quiet) as steps:
         yield lambda done, total: steps(label, done, total)
 
@@ -114,7 +114,7 @@ def connected(scheduler: str | None) -> "Iterator[Client | None]":
 
 @contextmanager
 def workers(scheduler: str | None) -> "Iterator[Runner | None]":
-    """Yield a runner on a dask scheduler; None for this process."""
+    """Yield a runner on a dask scheduler; None to compute in this process."""
     with connected(scheduler) as client:
         if client is None:
             yield None
@@ -125,7 +125,7 @@ def workers(scheduler: str | None) -> "Iterator[Runner | None]":
 
 
 def print_left_out(left_out: Sequence[str], listing: Path | None = None) -> None:
-    """Print how many measurements were left out for each reason, and the first of each."""
+    """Print how many measurements were omitted for each reason, and the first one of each."""
     texts = [line.split(": ", 1)[-1] for line in left_out]
     alike = [re.sub(r"[\d.]+", "0", text) for text in texts]
     named = "" if listing is None else f" (all named in {listing})"

@@ -1,4 +1,4 @@
-"""Shared by the commands: conversion of arguments to values, and display of values."""
+"""Functions shared by the commands: conversion of arguments to values, and display of values."""
 
 import json
 import math
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def parse_time(text: str) -> datetime:
-    """Return a time with time zone from ISO 8601; "now" means the present time."""
+    """Return a time with time zone from ISO 8601 text; "now" means the present time."""
     from datetime import UTC
 
     if text == "now":
@@ -37,14 +37,19 @@ def parse_time(text: str) -> datetime:
 
 
 def day_of(time: datetime, site: "Site") -> date:
-    """Return the day of a time: for UTC the site's own day, otherwise the day in its time zone."""
+    """Return the day of a time.
+
+    For a time in UTC it is the site's own day, otherwise the day in the time's zone.
+    """
     from heliotrope.sun import solar_day
 
     return time.date() if time.utcoffset() else solar_day(time, site)
 
 
 def sunlit(time: datetime, site: "Site", every: str, least: float = 1.0) -> "pd.DatetimeIndex":
-    """Return the times of a day with sunlight, at an interval such as "10min", ``least`` s or more.
+    """Return the times of a day with sunlight, at an interval such as "10min".
+
+    The interval must be at least ``least`` s.
 
     Raises
     ------
@@ -64,7 +69,10 @@ def sunlit(time: datetime, site: "Site", every: str, least: float = 1.0) -> "pd.
 
 
 def parse_duration(text: str, least: float = 1e-3) -> timedelta:
-    """Return a duration from "30s", "5min", "1h", of ``least`` s to 1000 h."""
+    """Return a duration from a text such as "30s", "5min" or "1h".
+
+    The duration must be from ``least`` s to 1000 h.
+    """
     refusal = f"duration {shown(text)}: write it as 30s, 5min or 1h, from {least:g} s to 1000 h"
     match = re.fullmatch(r"\s*(\d[\d.]*)\s*(s|min|m|h)\s*", text, re.ASCII)
     if match is None:
@@ -79,13 +87,13 @@ def parse_duration(text: str, least: float = 1e-3) -> timedelta:
 def parse_numbers(
     text: str, refusal: str, *, count: int | None = 1, least: float = -1e6, most: float = 1e6
 ) -> tuple[float, ...]:
-    """Return the numbers of "A,B,C".
+    """Return the numbers in a text "A,B,C".
 
     Raises
     ------
     InputError
-        With the line ``refusal``, if there are not ``count`` (None: one or more) numbers from
-        ``least`` to ``most``.
+        With the line ``refusal``, unless there are ``count`` numbers (None for one or more) between
+        ``least`` and ``most``.
     """
     try:
         values = tuple(float(part) for part in text.split(","))
@@ -100,21 +108,21 @@ def parse_numbers(
 
 
 def parse_point(text: str, what: str) -> tuple[float, float, float]:
-    """Return three numbers within ± 1e6 from "E,N,U"."""
+    """Return three numbers within ± 1e6 from a text "E,N,U"."""
     refusal = f"{what} {shown(text)}: write three numbers in metres as east,north,up"
     east, north, up = parse_numbers(text, refusal, count=3)
     return east, north, up
 
 
 def open_plant(path: Path, site: "Site | None" = None) -> "Plant":
-    """Return the plant of a file or folder, whatever its format."""
+    """Return the plant in a file or folder, whatever its format."""
     from heliotrope.field import formats
 
     return formats.open_plant(path, site=site)
 
 
 def parse_site(text: str) -> "Site":
-    """Return a site from "LATITUDE,LONGITUDE,HEIGHT", degrees and m."""
+    """Return a site from a text "LATITUDE,LONGITUDE,HEIGHT", in degrees and m."""
     from heliotrope.sun import Site
 
     refusal = (
@@ -126,7 +134,7 @@ def parse_site(text: str) -> "Site":
 
 
 def print_json(value: Any) -> None:
-    """Print one JSON document; NaN and infinity become null."""
+    """Print a JSON document in which NaN and infinity become null."""
     print(json.dumps(plain(value), ensure_ascii=False, indent=1))
 
 
@@ -147,7 +155,7 @@ def plain(value: Any) -> Any:
 
 
 def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> None:
-    """Print a table, the first column aligned left and the others right."""
+    """Print a table with the first column aligned left and the other columns right."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table

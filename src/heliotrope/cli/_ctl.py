@@ -1,4 +1,4 @@
-"""``heliotrope ctl``: look at and command a running plant, by its console or without."""
+"""``heliotrope ctl``: view and command a running plant, with or without its console."""
 
 import os
 import re
@@ -70,7 +70,7 @@ def _where(
         ),
     ] = None,
 ) -> None:
-    """Look at and command a running plant."""
+    """View and command a running plant."""
     context.obj = (url, token_file, data)
 
 
@@ -82,7 +82,7 @@ def _sign_in_client(context: typer.Context) -> "Client":
 
 
 def _sign_in(client: "Client", name: str, password: str) -> None:
-    """Sign in; ask for a code if the account has a second factor."""
+    """Sign in, and ask for a code if the account has a second factor."""
     from heliotrope.console.stream import RemoteError
 
     try:
@@ -135,7 +135,7 @@ def token(
         ),
     ] = 30.0,
 ) -> None:
-    """Create an API token, which is printed once. Asks for your password."""
+    """Create an API token, which is printed once; this asks for your password."""
     password = typer.prompt("Password", hide_input=True, err=True)
     with _sign_in_client(context) as client:
         _sign_in(client, name, password)
@@ -153,7 +153,7 @@ def password(
     context: typer.Context,
     name: Annotated[str, typer.Option(help="Name of your account.")] = "engineer",
 ) -> None:
-    """Change your own password; your sessions and tokens end."""
+    """Change your own password, which ends your sessions and tokens."""
     old = typer.prompt("Password", hide_input=True)
     new = typer.prompt("New password", hide_input=True, confirmation_prompt=True)
     with _sign_in_client(context) as client:
@@ -247,7 +247,7 @@ def account(
 
 @app.command()
 def status(context: typer.Context, as_json: Json = False) -> None:
-    """Print a summary of the plant."""
+    """Print a summary of the plant's state."""
     with _client(context) as client:
         answer = client.get("summary")
         order = client.get("emergency") if answer["emergency"] else {}
@@ -270,7 +270,7 @@ def status(context: typer.Context, as_json: Json = False) -> None:
 
 @app.command()
 def aims(context: typer.Context, as_json: Json = False) -> None:
-    """Print how aims are chosen, and how far the flux is from its limit."""
+    """Print how aims are chosen, and how close the flux is to its limit."""
     with _client(context) as client:
         answer = client.get("aims")
     if as_json:
@@ -344,7 +344,7 @@ def flux(
     ] = "",
     as_json: Json = False,
 ) -> None:
-    """Print the predicted flux on a receiver, with standard deviations."""
+    """Print the predicted flux on a receiver, with its standard deviations."""
     with _client(context) as client:
         name = receiver or (client.get("field")["receivers"] or [""])[0]
         if not name:
@@ -361,7 +361,7 @@ def flux(
 
 
 def _give_or_take(value: float, sigma: float | None, unit: str) -> str:
-    """Return a value with its standard deviation, if known, in a unit of 1000."""
+    """Return a value and, if known, its standard deviation, in thousands of its unit."""
     digits = f"{1e-3 * value:.0f}"
     return f"{digits} {unit}" if sigma is None else f"{digits} ± {1e-3 * sigma:.0f} {unit}"
 
@@ -372,7 +372,7 @@ def why(
     heliostat: Annotated[str, typer.Argument(help="Heliostat.")],
     as_json: Json = False,
 ) -> None:
-    """Explain why a heliostat tracks or not, what happens next, and what you can do."""
+    """Explain why a heliostat does or does not track, what happens next, and what you can do."""
     from urllib.parse import quote
 
     with _client(context) as client:
@@ -401,7 +401,7 @@ def events(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Print the last events since the start of the plant, the latest first."""
+    """Print the latest events since the start of the plant, newest first."""
     with _client(context) as client:
         found = client.get(f"events?limit={limit}")
         for event in found if all_names else ():
@@ -437,7 +437,7 @@ def journal(
     limit: Annotated[int, typer.Option(min=1, max=2000, help="Maximum number of entries.")] = 200,
     as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
 ) -> None:
-    """Print events, alarms and commands of all days, the latest first."""
+    """Print events, alarms and commands of all days, newest first."""
     import csv
     import sys
     from urllib.parse import urlencode
@@ -570,7 +570,7 @@ def note(
 def stow(
     context: typer.Context, heliostats: Whom = None, everybody: All = False, wait: Wait = 0.0
 ) -> None:
-    """Send heliostats to stow; needs no command authority."""
+    """Send heliostats to stow, without needing the command authority."""
     _give(context, "STOW", _names(heliostats, everybody), (), wait)
 
 
@@ -578,7 +578,7 @@ def stow(
 def defocus(
     context: typer.Context, heliostats: Whom = None, everybody: All = False, wait: Wait = 0.0
 ) -> None:
-    """Move beams off the receiver; needs no command authority."""
+    """Move beams off the receiver, without needing the command authority."""
     _give(context, "DEFOCUS", _names(heliostats, everybody), (), wait)
 
 
@@ -596,7 +596,7 @@ def command(
     ] = None,
     wait: Wait = 60.0,
 ) -> None:
-    """Take the command authority, give a command, wait for completion, and release it."""
+    """Take the command authority, issue a command, await its completion, release the authority."""
     _give(context, name.upper(), _names(heliostats, everybody), tuple(value or ()), wait)
 
 
@@ -631,7 +631,7 @@ def aim(
     ] = None,
     wait: Wait = 60.0,
 ) -> None:
-    """Aim heliostats at a receiver or a point on it, a target, standby or a point in space."""
+    """Aim heliostats at a receiver or a point on it, a target, standby, or a point in space."""
     names = _names(heliostats, everybody)
     order: dict[str, Any] = {"heliostats": names, "where": where}
     if where == "standby":
@@ -671,7 +671,7 @@ def emergency(
 
 
 def _print_causes(answer: dict[str, Any]) -> None:
-    """Print the active orders of persons or, if there are none, why an emergency is active."""
+    """Print operators' active orders or, if there are none, why an emergency is active."""
     for call in answer["calls"]:
         print(f"ordered by {call['who']} ({call['act']}, {_utc(call['at'])}): {call['reason']}")
     if answer["on"] and not answer["calls"]:
@@ -724,7 +724,7 @@ def calibrate(
     ] = False,
     wait: Wait = 3600.0,
 ) -> None:
-    """Let automatic control calibrate heliostats next, and wait for the results."""
+    """Have automatic control calibrate heliostats next, and wait for the results."""
     if search and (together or receiver):
         raise InputError("calibrate: --search looks for one beam; leave out --together, --receiver")
     if receiver and (together or target):
@@ -761,8 +761,8 @@ def error_parameters(
 ) -> None:
     """Show or set the error parameters of a heliostat at stow, locked or at rest.
 
-    Where the plant file asks for a second approval, they wait for it; see `ctl approvals`.
-    Angles are in mrad and lengths in mm; NAME_deg=VALUE is in degrees.
+    If the plant file requires a second approval, changes wait for it; see `ctl approvals`. Angles
+    are in mrad and lengths in mm; NAME_deg=VALUE is in degrees.
     """
     from urllib.parse import quote
 
@@ -806,9 +806,9 @@ def approvals(
     wait: Wait = 60.0,
     as_json: Json = False,
 ) -> None:
-    """List changes of parameters that wait for a second engineer; approve, refuse or withdraw one.
+    """List parameter changes that await a second engineer; approve, refuse or withdraw one.
 
-    The author or whoever approves must have the command authority; else it is taken for the moment.
+    The author or the approver must hold the command authority; otherwise it is taken briefly.
     """
     if (approve + refuse + withdraw > 1) or bool(number) != (approve or refuse or withdraw):
         raise InputError(
@@ -867,7 +867,7 @@ _SHOWN = {"rad": ("mrad", 1e-3), "m": ("mm", 1e-3), "1": ("", 1.0)}
 
 
 def _parameter(text: str, units: dict[str, str]) -> tuple[str, float]:
-    """Return the name and value from NAME=VALUE, in the unit of the API."""
+    """Return the name and value from a text NAME=VALUE, in the API's unit."""
     key, _, number = text.partition("=")
     name = key
     for ending in ("_mrad", "_mm", "_deg"):
@@ -918,7 +918,7 @@ def versions(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Compare two versions of a heliostat's error parameters, and their effect on its beam."""
+    """Compare two versions of a heliostat's error parameters and their effect on the beam."""
     path = f"heliostats/{quote(heliostat, safe='')}"
     with _client(context) as client:
         if second is None:
@@ -952,7 +952,7 @@ def photograph(
     context: typer.Context,
     target: Annotated[str, typer.Argument(help="Target.")],
 ) -> None:
-    """Photograph a target now, and print what is seen on it."""
+    """Photograph a target now, and print the evaluation of the photograph."""
     from urllib.parse import quote
 
     with _client(context) as client:
@@ -978,7 +978,7 @@ def photographs(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """List the stored photographs of a heliostat, each with the result of its visit."""
+    """List the stored photographs of a heliostat, each with the result of its calibration visit."""
     if save is not None and not heliostat:
         raise InputError("ctl photographs: --save needs the name of a heliostat")
     with _client(context) as client:
@@ -998,12 +998,12 @@ def photographs(
 def _save_calibration(
     client: "Client | AtPlant", heliostat: str, kept: list[dict[str, Any]], folder: Path
 ) -> None:
-    """Save the first and the last photograph of a heliostat's last calibration, as the page does.
+    """Save the first and last photographs of a heliostat's last calibration, as the page does.
 
     Raises
     ------
     InputError
-        If it has no result or no kept photograph, or the folder cannot be written.
+        If the heliostat has no result or no stored photograph, or the folder cannot be written.
     """
     results = client.get(f"heliostats/{quote(heliostat, safe='')}")["results"]
     if not results:
@@ -1037,7 +1037,7 @@ def frames(
     ] = "",
     as_json: Json = False,
 ) -> None:
-    """Record the frames on a cluster's bus for five seconds, and print them decoded."""
+    """Record the frames on a cluster's bus for five seconds, and print them in decoded form."""
     from urllib.parse import quote
 
     with _client(context) as client:
@@ -1068,7 +1068,7 @@ def flight(
     file: Annotated[Path, typer.Argument(help="flight.json of `heliotrope drone evaluate`.")],
     name: Annotated[str, typer.Option(help="Another name for the flight.")] = "",
 ) -> None:
-    """Import a drone flight; the plant fits all its heliostats together, and nothing moves."""
+    """Import a drone flight; the plant then fits all its heliostats, without moving any."""
     from heliotrope.calibration.flights import read_flight
 
     document = read_flight(file).model_dump()
@@ -1095,7 +1095,7 @@ def learn(
         str, typer.Option(help="Group of the plant file.", show_default="all groups")
     ] = "",
 ) -> None:
-    """Learn drift, noise and installation errors now, as at night; nothing moves."""
+    """Learn drift, noise and installation errors now, as is done at night, without any motion."""
     with _client(context) as client:
         answer = client.ask("POST", "learning", {"group": group})
     for entry in answer:
@@ -1132,7 +1132,7 @@ def timetable(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Show or change the calibrations scheduled at times of day and at intervals."""
+    """Show or change the calibrations that are scheduled at times of day or at intervals."""
     gives = bool(heliostats or target or at or every or rule)
     if plant_file and (name or gives or remove):
         raise InputError("ctl timetable: --plant-file cannot be combined with other options")
@@ -1167,7 +1167,7 @@ def timetable(
 
 
 def _entries(in_force: list[dict[str, Any]], name: str, remove: bool) -> list[dict[str, Any]]:
-    """Return the entries in force except one, in the form that the API accepts."""
+    """Return all entries in force except one, in the form that the API accepts."""
     if remove and name not in [entry["name"] for entry in in_force]:
         raise UnknownNameError("timetable entry", name, [entry["name"] for entry in in_force])
     keys = ("name", "heliostats", "target", "at", "every_s", "rule")
@@ -1185,7 +1185,7 @@ def reading(
         ),
     ],
 ) -> None:
-    """Submit a sensor reading to the safety table, if the links file says "api"."""
+    """Submit a sensor reading to the safety table, if the links file has "api" as its source."""
     from urllib.parse import quote
 
     with _client(context) as client:
@@ -1212,7 +1212,7 @@ def out_of_service(
     ] = None,
     wait: Wait = 600.0,
 ) -> None:
-    """Lock heliostats, targets, receivers or the tower; wait until all are parked."""
+    """Lock heliostats, targets, receivers or the tower, and wait until all are parked."""
     order = {**_places(heliostats, targets, receivers, tower), "reason": reason, "hours": hours}
     with _client(context) as client:
         _follow_all(client, [client.ask("POST", "holds", order)], wait)
@@ -1230,7 +1230,7 @@ def give_back(
     ] = "",
     reason: Annotated[str, typer.Option(help="Reason for removing another user's lock.")] = "",
 ) -> None:
-    """Remove your locks; nothing moves. An object is in service when nobody's lock is left."""
+    """Remove your locks, without any motion; an object is in service once no lock is left."""
     order = {**_places(heliostats, targets, receivers, tower), "owner": owner, "reason": reason}
     with _client(context) as client:
         left = client.ask("POST", "holds/release", order)
@@ -1244,7 +1244,7 @@ def _places(
     receivers: list[str] | None,
     tower: bool,
 ) -> dict[str, object]:
-    """Return the places that a person locks or unlocks, in the form that the API accepts."""
+    """Return the objects that an operator locks or unlocks, in the form that the API accepts."""
     named = {"heliostats": heliostats, "targets": targets, "receivers": receivers}
     return {key: list(names or ()) for key, names in named.items()} | {"tower": tower}
 
@@ -1253,7 +1253,7 @@ def _places(
 def automatic(
     context: typer.Context, heliostats: Whom = None, everybody: All = False, wait: Wait = 600.0
 ) -> None:
-    """Give heliostats to automatic control; wait until they follow, or print why they do not."""
+    """Hand heliostats to automatic control; wait until they follow, or print why they do not."""
     names = _names(heliostats, everybody)
     with _client(context) as client:
         _follow_all(client, [client.ask("POST", "automatic", {"heliostats": names})], wait)
@@ -1261,7 +1261,7 @@ def automatic(
 
 @app.command()
 def resume(context: typer.Context) -> None:
-    """Resume automatic control after a loss of many heliostats."""
+    """Resume automatic control after many heliostats were lost."""
     with _client(context) as client:
         client.ask("POST", "automatic/resume")
     print("automatic control resumed")
@@ -1291,7 +1291,7 @@ def _give(
 def _follow_with_authority(
     client: "Client | AtPlant", path: str, order: dict[str, Any] | None, wait: float
 ) -> None:
-    """Issue an order that needs the command authority, and follow it to its end."""
+    """Issue an order that needs the command authority, and follow the order to its end."""
     client.ask("POST", "authority")
     try:
         _follow(client, client.ask("POST", path, order), wait)
@@ -1300,7 +1300,7 @@ def _follow_with_authority(
 
 
 def _follow_all(client: "Client | AtPlant", tickets: list[dict[str, Any]], wait: float) -> None:
-    """Print the progress of operations to their ends; exit code 1 if one is not done."""
+    """Print the progress of operations to their ends; exit code 1 if any is not completed."""
     until, printed = time.monotonic() + wait, dict[str, str]()
     while True:
         for ticket in tickets:
@@ -1324,9 +1324,9 @@ def _follow_all(client: "Client | AtPlant", tickets: list[dict[str, Any]], wait:
 def _follow(
     client: "Client | AtPlant", ticket: dict[str, Any], wait: float, keeping: bool = True
 ) -> None:
-    """Wait for the end of a command and print it; exit code 1 if it failed.
+    """Wait for the end of a command and print its result; exit code 1 if it failed.
 
-    With ``keeping`` it keeps the command authority until then, if the command needs it.
+    With ``keeping``, the command authority is held until then, if the command needs it.
     """
     until = time.monotonic() + wait
     while not ticket["finished"] and time.monotonic() < until:

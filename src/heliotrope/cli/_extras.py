@@ -15,12 +15,12 @@ _WHOLE = {"run": "console", "ctl": "console", "store": "store"}
 
 
 def missing(error: ModuleNotFoundError, command: str) -> InputError | None:
-    """Return the refusal for a package that is not installed; None: no extra contains it.
+    """Return the refusal for a missing package; None if no extra contains the package.
 
     Parameters
     ----------
     error
-        What the import raised.
+        Error that the import raised.
     command
         Name of the command; empty if unknown.
     """

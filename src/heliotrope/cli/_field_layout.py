@@ -57,10 +57,10 @@ def layout(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Write a plant of a pattern: heliostats in clusters, tower, two targets with cameras.
+    """Write a generated plant: heliostats in clusters, a tower, and two targets with cameras.
 
-    The field lies on the side of the tower away from the equator; rows and the twin field lie on
-    both sides.
+    The field lies on the side of the tower away from the equator; the patterns of rows and twin
+    fields lie on both sides.
     """
     from heliotrope.errors import InputError
     from heliotrope.field.formats.plant_file import write_plant

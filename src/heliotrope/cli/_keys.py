@@ -1,4 +1,4 @@
-"""``heliotrope keys``: make and replace the keys of the links between plant and clusters."""
+"""``heliotrope keys``: create and replace the keys of the links between plant and clusters."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -51,7 +51,7 @@ def _open(path: Path) -> "KeyFile":
 
 @app.command()
 def new(file: PlantFile, clusters: Clusters, to: FolderOption) -> None:
-    """Create a key per cluster, in the plant's key file and in a file to carry to the cluster."""
+    """Create one key per cluster, in the plant's key file and in a file for the cluster."""
     from heliotrope.links.keys import carried_files
 
     keys = _open(file)
@@ -62,7 +62,7 @@ def new(file: PlantFile, clusters: Clusters, to: FolderOption) -> None:
 
 @app.command()
 def rotate(file: PlantFile, clusters: Clusters, to: FolderOption) -> None:
-    """Create a second key for each cluster; plant and cluster may both keep running."""
+    """Create a second key for each cluster, while the plant and the clusters keep running."""
     from heliotrope.links.keys import carried_files
 
     keys = _open(file)
@@ -76,7 +76,7 @@ def take(
     file: Annotated[Path, typer.Argument(help="Key file of the cluster.")],
     carried: Annotated[Path, typer.Argument(help="File created by keys new or keys rotate.")],
 ) -> None:
-    """Import a carried key into the cluster's key file, beside the old key if there is one."""
+    """Import a key file into the cluster's key file, and keep the old key if there is one."""
     from heliotrope.errors import InputError
     from heliotrope.links.keys import fingerprint
 
@@ -95,7 +95,7 @@ def end(
         list[str] | None, typer.Argument(help="Names of clusters; default: all with an old key.")
     ] = None,
 ) -> None:
-    """Remove the old keys, so that only the new ones are accepted."""
+    """Remove the old keys, so that only the new keys are accepted."""
     ended = _open(file).end(names or [])
     print(f"{file}: old keys removed: {', '.join(ended)}")
 
@@ -105,7 +105,7 @@ def list_(
     file: Annotated[Path, typer.Argument(help="Key file of the plant or of a cluster.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """List whose keys a file contains, by fingerprints that reveal nothing; newest first."""
+    """List the keys in a file by fingerprints that reveal nothing, newest first."""
     from heliotrope.errors import InputError
     from heliotrope.links.keys import fingerprint
 
@@ -135,7 +135,7 @@ def tls(
         ),
     ] = False,
 ) -> None:
-    """Create or renew the console's certificate, under a private authority that is created once."""
+    """Create or renew the console's certificate under a private authority, created if missing."""
     from heliotrope.cli._common import parse_time
     from heliotrope.errors import InputError
 
@@ -173,7 +173,7 @@ def _bus(path: Path) -> "BusKeyFile":
 
 @bus_app.command(name="new")
 def bus_new(file: BusFile) -> None:
-    """Create the bus key; the cluster distributes it to its local controllers."""
+    """Create the bus key, which the cluster distributes to its local controllers."""
     keys = _bus(file)
     keys.new()
     _show(keys)
@@ -181,7 +181,7 @@ def bus_new(file: BusFile) -> None:
 
 @bus_app.command(name="rotate")
 def bus_rotate(file: BusFile) -> None:
-    """Create a second key beside the present one; the cluster keeps running."""
+    """Create a second key and keep the present key, while the cluster keeps running."""
     keys = _bus(file)
     keys.rotate()
     _show(keys)
@@ -189,7 +189,7 @@ def bus_rotate(file: BusFile) -> None:
 
 @bus_app.command(name="end")
 def bus_end(file: BusFile) -> None:
-    """Remove the old key, once frames are signed with the new one."""
+    """Remove the old key, once frames are signed with the new key."""
     keys = _bus(file)
     keys.end()
     _show(keys)
@@ -197,7 +197,7 @@ def bus_end(file: BusFile) -> None:
 
 @bus_app.command(name="off")
 def bus_off(file: BusFile) -> None:
-    """Remove all keys; the cluster removes them from local controllers that are at rest."""
+    """Remove all keys; the cluster then removes them from local controllers that are at rest."""
     keys = _bus(file)
     keys.off()
     print(f"{file}: no key left; each local controller drops its key once its mirrors are at rest")

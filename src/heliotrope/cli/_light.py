@@ -96,7 +96,7 @@ def light_of(
     cells: str | None,
     tower: list[str] | None,
 ) -> "FieldOptics":
-    """Return the light that the options describe; its canting needs a plant."""
+    """Return the light that the options describe; its canting requires a plant."""
     from heliotrope.optics import FieldOptics
 
     return FieldOptics(
@@ -135,7 +135,7 @@ def _facets(text: str) -> tuple[int, int]:
 
 
 def canting_of(text: str, plant: "Plant") -> Any:
-    """Return the canting of facets: "slant", a focal length or a sun position."""
+    """Return the canting of facets from "slant", a focal length, or a sun position."""
     from heliotrope.sun import vector
 
     if text == "slant":

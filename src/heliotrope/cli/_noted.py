@@ -1,7 +1,7 @@
-"""Records in a plant's store what users do with it: backups, exports, queries.
+"""Records of what users do with a plant's store: backups, exports, queries.
 
-A running plant records this itself, through its local interface; if the plant is stopped, the
-command writes to the store.
+A running plant writes such a record itself, when the command asks for it over the local interface.
+If the plant is stopped, the command writes the record to the store.
 """
 
 import os
@@ -25,14 +25,14 @@ def this_person() -> str:
 
 
 def note_use(place: str, kind: str, detail: str) -> None:
-    """Record in a store what this user did with it; report if that is not possible.
+    """Record a user's action in a plant's store; report if the record cannot be written.
 
     Parameters
     ----------
     place
         Data folder of a plant, or the URL of its database.
     kind, detail
-        Name of a `SecurityEvent`, and what was done.
+        Name of a `SecurityEvent`, and a description of the action.
     """
     detail = " ".join(detail.split())[:_LONGEST]
     try:

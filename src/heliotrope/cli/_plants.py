@@ -1,4 +1,4 @@
-"""The plant that a command runs: a plant file, the default plant, or the prototype."""
+"""The plant that a command works on: a plant file, the default plant, or the prototype."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,7 +27,7 @@ def one_plant(command: str, field: Path | None, heliostats: int | None, *, proto
 
 
 def design_of(field: Path | None, heliostats: int | None, *, prototype: bool) -> "Plant":
-    """Return the plant of a file or folder, the prototype, or the default plant."""
+    """Return the plant in a file or folder, the prototype, or the default plant."""
     if field is not None:
         return open_plant(field)
     if prototype:
@@ -40,13 +40,13 @@ def design_of(field: Path | None, heliostats: int | None, *, prototype: bool) ->
 
 
 def start_of(command: str, text: str, design: "Plant") -> "datetime":
-    """Return a simulated start time; "morning" or a day: three hours before noon at the site.
+    """Return a simulated start time; for "morning" or a day, three hours before local noon.
 
     Raises
     ------
     TimeError
-        If the time is invalid, or local controllers cannot count it: 32 bits of GPS seconds, from
-        1980.
+        If the time is invalid, or outside the range of local controllers, which count GPS seconds
+        from 1980 in 32 bits.
     """
     from datetime import UTC, date, datetime, timedelta
     from datetime import time as hour

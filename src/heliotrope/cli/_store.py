@@ -1,4 +1,4 @@
-"""``heliotrope store``: look at, back up, restore, export and migrate the store of a plant."""
+"""``heliotrope store``: inspect, back up, restore, export and migrate the store of a plant."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -64,7 +64,7 @@ def backup(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Create a backup; the plant may keep running."""
+    """Create a backup, while the plant may keep running."""
     from heliotrope.store import backup as backups
     from heliotrope.store.database import Database
     from heliotrope.store.signing import SigningKey
@@ -116,7 +116,7 @@ def restore(
 def key(
     file: Annotated[Path, typer.Argument(help="File to create; the public key is FILE.pub.")],
 ) -> None:
-    """Create the key pair for backups: the private key signs, the public key checks."""
+    """Create the key pair for backups: a private key for signing, and a public key for checking."""
     from heliotrope.store.signing import make_key
 
     print(
@@ -144,7 +144,7 @@ def export(
 
 @app.command()
 def migrate(place: Place) -> None:
-    """Migrate the tables of a store to the current version; the plant must be stopped."""
+    """Migrate a store's tables to the current version, while the plant is stopped."""
     from heliotrope.store import backup as backups
     from heliotrope.store.database import HEAD
 
@@ -161,7 +161,7 @@ def purge(
     folder: Annotated[Path, typer.Argument(help="Data folder of a stopped plant.")],
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
 ) -> None:
-    """Overwrite and remove all data of a plant, before its computer is decommissioned."""
+    """Overwrite and remove all data of a plant before its computer is decommissioned."""
     from heliotrope.store.purge import purge as remove
 
     if not yes:

@@ -7,7 +7,7 @@ from heliotrope.errors import shown
 
 
 def refusal(error: TyperException) -> str | None:
-    """Return the line of an error, None if it only asks for help: a group without a command."""
+    """Return the line for an error; None if a group without a command only requests help."""
     context = getattr(error, "ctx", None)
     if context is not None and error.message == context.get_help():
         return None
@@ -16,7 +16,7 @@ def refusal(error: TyperException) -> str | None:
 
 
 def _number(error: TyperException) -> str | None:
-    """Return the limits of a number in words; None for other errors.
+    """Return the limits of a number in words; None for any other error.
 
     Each numeric option of the command line declares its limits, ``min`` and ``max``.
     """

@@ -1,4 +1,4 @@
-"""``heliotrope aim``: aims that keep the flux on a receiver under a limit despite mirror errors."""
+"""``heliotrope aim``: aims that keep the receiver's flux below a limit despite mirror errors."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -122,7 +122,7 @@ def aim(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Choose aims of most power that keep the flux under a limit with a chosen probability."""
+    """Choose aims with the highest power that keep the flux below a limit with a probability."""
     from heliotrope.aims import STRATEGIES, SharedErrors, plan_aims
 
     light = light_of(
@@ -203,7 +203,7 @@ def _wanted(text: str) -> "FluxLimit | None":
 
 
 def _print_ramp(chosen: "AimPlan", joins: "FloatArray") -> None:
-    """Print the course of the start-up: one line per quarter of the power."""
+    """Print the course of the start-up, with one line per quarter of the power."""
     import numpy as np
 
     order = np.argsort(joins)

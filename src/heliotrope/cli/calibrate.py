@@ -1,4 +1,4 @@
-"""``heliotrope calibrate``: learn the heliostats' imperfections from measurements."""
+"""``heliotrope calibrate``: learn the imperfections of heliostats from measurements."""
 
 import math
 from pathlib import Path
@@ -32,7 +32,7 @@ def calibrate(
     report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("out/calibration"),
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Learn every heliostat from all its sightings, test on held-out ones, write a report."""
+    """Learn heliostats from their sightings, test on held-out sightings, and write a report."""
     import time
 
     from heliotrope.calibration import evaluation, workflow

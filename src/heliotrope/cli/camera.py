@@ -1,4 +1,4 @@
-"""``heliotrope camera``: calibrate target cameras, and teach them their targets."""
+"""``heliotrope camera``: calibrate target cameras, and mark the targets in their pictures."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -52,7 +52,7 @@ def calibrate(
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate a lens with a chessboard, or lens and pose from the marks of targets."""
+    """Calibrate a lens with a chessboard, or the lens and pose with the marks of targets."""
     if (chessboard is None) != (square is None):
         raise InputError("--chessboard and --square go together: --chessboard 9x6 --square 0.03")
     board = None if chessboard is None or square is None else (_pattern(chessboard), square)
@@ -89,7 +89,7 @@ def _from_chessboard(
     old = next((c for c in plant.cameras if c.name == name), None)
     camera = lens.camera(name)
     if old is not None:
-        # Its pose was determined with the old lens.
+        # The camera's pose was determined with the old lens.
         camera = replace(camera, targets=old.targets, source=old.source)
     write_with_pictures(with_camera(plant, camera), places[1], places[0].parent)
     forgotten = old is not None and old.position is not None
@@ -232,7 +232,7 @@ def teach(
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Mark a target's points in one picture, to obtain its marks and the camera pose."""
+    """Mark a target's points in a picture, which yields the target's marks and the camera pose."""
     from heliotrope.imaging.targets import teaching
 
     place = _place_to_write(plant, out)
@@ -305,7 +305,7 @@ def _wishes(
 
 
 def _split(texts: Sequence[str], read: Callable[[str], Value]) -> dict[str, Value]:
-    """Return values by the name before "="; a value without a name is under ""."""
+    """Return values by the name before "="; a value without a name is stored under ""."""
     values: dict[str, Value] = {}
     for text in texts:
         name, _, value = text.rpartition("=")
@@ -397,7 +397,7 @@ def receiver(
     ] = 1.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Create the reference for a camera that measures the flux on the receiver."""
+    """Create the reference picture for a camera that measures the flux on the receiver."""
     from heliotrope.imaging.receiver_file import write_reference
     from heliotrope.imaging.receiver_light import ReceiverSight, take_reference
     from heliotrope.imaging.sources import average
@@ -553,7 +553,7 @@ def _print_cameras(cameras: "Sequence[Camera]") -> None:
 
 
 def _place_to_write(plant: Path, out: Path | None) -> Path:
-    """Return the plant file to write; checked before any computation."""
+    """Return the plant file to write, which is checked before any computation."""
     if plant.suffix.lower() == ".json":
         raise FormatError(
             plant,
@@ -575,7 +575,7 @@ def _read(image: Path) -> "Frame":
 
 
 def _field(camera: "Camera") -> Any:
-    """Return the angles of view, horizontal and vertical, rad, (2,)."""
+    """Return the horizontal and vertical angles of view, rad, (2,)."""
     import numpy as np
 
     from heliotrope.field.camera import undistort

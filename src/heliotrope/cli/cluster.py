@@ -24,7 +24,7 @@ def cluster(
         float, typer.Option(min=1, max=86_400, help="Interval between log lines, s.")
     ] = 10.0,
 ) -> None:
-    """Run a cluster of heliostats until SIGTERM or Ctrl-C; it then defocuses them."""
+    """Run a cluster of heliostats until SIGTERM or Ctrl-C; the cluster then defocuses them."""
     from heliotrope.errors import InputError
 
     try:
@@ -51,7 +51,7 @@ def cluster(
 
 
 async def _run(installation: "Installation", every: float) -> None:
-    """Run everything until SIGTERM or SIGINT."""
+    """Run the cluster until SIGTERM or SIGINT."""
     import asyncio
     import signal
 

@@ -1,4 +1,4 @@
-"""``heliotrope commission``: plan the days in which a new field is calibrated."""
+"""``heliotrope commission``: plan the days on which a new field is calibrated."""
 
 import sys
 from dataclasses import replace
@@ -105,7 +105,7 @@ def commission(
         Path | None, typer.Option(help="Picture to write (.png, .svg or .pdf).")
     ] = None,
 ) -> None:
-    """Plan the days that bring a new field to its goal: which mirrors, when, and where."""
+    """Plan the days on which a new field is calibrated to its goal: heliostats, times, targets."""
     from heliotrope.calibration.plan.commission import CommissionTerms
     from heliotrope.calibration.plan.report import check_picture
 
@@ -141,7 +141,7 @@ def commission(
 def _joint(
     plant: "Plant", together: int | None, first: int | None, step: str, sigma_mrad: float
 ) -> "JointTerms | None":
-    """Return the joint visits of the plant file, as changed by the options."""
+    """Return the joint visits of the plant file, modified by the options."""
     from heliotrope.calibration.plan.joint_terms import JointTerms
     from heliotrope.errors import InputError
     from heliotrope.field.coded_visits import JointSettings
@@ -183,7 +183,7 @@ def _fleets(
     flight: tuple[int, int],
     quiet: bool,
 ) -> "tuple[list[Fleet], Any, dict[str, Any] | None]":
-    """Return the knowledge of the heliostats, the measured heliostats, and the flight's results."""
+    """Return the knowledge of all heliostats, the measured heliostats, and a flight's results."""
     import numpy as np
 
     from heliotrope.calibration.plan.fleets import fleets_of
@@ -210,7 +210,7 @@ def _fleets(
 def _flown(
     plant: "Plant", fleets: "list[Fleet]", model: str, flight: tuple[int, int], quiet: bool
 ) -> "tuple[list[Fleet], dict[str, Any]]":
-    """Return the fleets after a flight, where each heliostat stands for its whole cluster."""
+    """Return the fleets after a flight; each heliostat in them stands for its whole cluster."""
     import numpy as np
 
     from heliotrope.airborne.plan import Craft, PlanSettings, PointSelection, plan_flight

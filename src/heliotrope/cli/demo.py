@@ -1,4 +1,4 @@
-"""``heliotrope demo``: an example plant is measured, calibrated and tracked for a day."""
+"""``heliotrope demo``: measure, calibrate and track an example plant for a day."""
 
 from datetime import date, timedelta
 from pathlib import Path
@@ -12,7 +12,7 @@ from heliotrope.warm import compiling
 
 #: The day of the demonstration; mirrors are measured during the week before it.
 DAY = date(2026, 9, 2)
-#: Heliostats with pictures of their own in the report, enough to see what a report shows.
+#: Number of heliostats with their own pictures in the report, enough to see what a report shows.
 SECTIONS = 2
 #: The usual parameters of this kind of mechanism, and the survey.
 MODEL = (
@@ -28,7 +28,7 @@ def demo(
     ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Make an example plant, measure it, calibrate it, track a day, and write a report."""
+    """Create an example plant, measure it, calibrate it, track it for a day, and report."""
     import numpy as np
 
     from heliotrope.calibration.demonstration import day_picture, measure, track_day

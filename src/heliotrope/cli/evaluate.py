@@ -42,10 +42,10 @@ def evaluate(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Learn from a part of each heliostat's sightings and print the errors of the rest.
+    """Learn from some of each heliostat's sightings and print the errors of the others.
 
-    Everything, the model and the hyperparameters of the field included, is learnt from the
-    training part alone.
+    Everything is learnt from the training part alone, including the model and the hyperparameters
+    of the field.
     """
     import time
 
@@ -104,7 +104,7 @@ def evaluate(
 
 
 def _unobstructed(field: "FieldSightings") -> "Unobstructed":
-    """Return the sightings corrected for neighbours, which look at the first receiver."""
+    """Return the sightings corrected for neighbours, assumed to aim at the first receiver."""
     from heliotrope.calibration.obstruction import unobstructed
 
     plant = field.plant

@@ -18,7 +18,7 @@ def fetch(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Download properties and measurements of heliostats; files already there are kept."""
+    """Download properties and measurements of heliostats; existing files are kept."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     from heliotrope.field.formats import fetch as fetching

@@ -1,4 +1,4 @@
-"""``heliotrope field``: make and check plant files."""
+"""``heliotrope field``: create and check plant files."""
 
 from pathlib import Path
 from typing import Annotated
@@ -60,7 +60,7 @@ def safety(
     file: Annotated[Path, typer.Argument(help="Plant file (TOML).")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Print the safety-table limits that a plant may set, with defaults and ranges.
+    """Print the safety-table limits that a plant may set, with their defaults and ranges.
 
     An asterisk marks limits changed by the tables [safety.CONDITION] of the plant file.
     """
@@ -102,11 +102,11 @@ def defocus(
     file: Annotated[Path, typer.Argument(help="Plant file (TOML).")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Print how intense the light beside the receiver is after a field-wide DEFOCUS.
+    """Print the intensity of the light beside the receiver after a field-wide DEFOCUS.
 
-    In suns, at the most intense point: with all heliostats turned by the same angles, and as spread
-    by the plant file; and the distance from the receiver centre up to which there are more than 10
-    suns.
+    The intensity at the most intense point is in suns, once with all heliostats turned by the same
+    angles, and once with the spread of the plant file. Also printed is the distance from the
+    receiver centre within which there are more than 10 suns.
     """
     import numpy as np
 
@@ -236,7 +236,7 @@ def restore(
     version: Annotated[str, typer.Argument(help="A name from `heliotrope field versions`.")],
     note: Note = "",
 ) -> None:
-    """Restore a stored version of a plant file and its table; keep the present one."""
+    """Restore a stored version of a plant file and its table; the present version is kept."""
     from heliotrope.field.formats import plant_edit
 
     kept = plant_edit.restore(file, version, note=note)

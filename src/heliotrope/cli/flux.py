@@ -1,4 +1,4 @@
-"""``heliotrope flux``: what each heliostat sends to the receiver, and what is lost where."""
+"""``heliotrope flux``: the flux that each heliostat sends to the receiver, and its losses."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -118,7 +118,7 @@ def flux(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Show the flux on the receivers and the efficiencies of the field and of each heliostat."""
+    """Show the flux on the receivers and the efficiencies of the field and its heliostats."""
     light = light_of(
         dni, shape, air, slope_mrad, error_mrad, reflectivity, clean, focus, facets, cells, tower
     )
@@ -155,7 +155,7 @@ class _Order:
     as_json: bool
 
     def check(self, field: Path, *, table: bool, year: bool) -> None:
-        """Refuse files that cannot be written, or for which this table has no data."""
+        """Refuse files that cannot be written, or for which this table contains no data."""
         from heliotrope.calibration.plan.report import check_picture
         from heliotrope.cli.plan import check_outputs
 
@@ -171,7 +171,7 @@ class _Order:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Arguments of `field_flux`, `flux_day` and `flux_year`."""
+        """Return the arguments of `field_flux`, `flux_day` and `flux_year`."""
         return {"receiver": self.receiver, "aim": self.aim, "light": self.light}
 
     def print_files(self) -> None:
@@ -266,7 +266,7 @@ def _document(result: "PlantFlux", when: Any) -> dict[str, Any]:
 
 
 def _second(result: "PlantFlux", second: "PlantFlux") -> dict[str, Any]:
-    """Return the result of ray tracing beside that of the engine."""
+    """Return the ray-tracing result together with the engine's result."""
     import numpy as np
 
     apart = [a.flux - b.flux for a, b in zip(result.maps, second.maps, strict=True)]

@@ -84,7 +84,7 @@ def image(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Find spots on targets: in metres with covariance, or the reason why not."""
+    """Find spots on targets: positions in m with covariance, or the reason for failure."""
     from heliotrope.imaging import campaign
     from heliotrope.imaging.log import read_log
     from heliotrope.values import amount
@@ -163,11 +163,11 @@ class Place:
     targets, cameras
         Targets and cameras of the plant.
     site
-        Its reference point.
+        Reference point of the plant.
     names
-        Names of its heliostats; empty if the file has none.
+        Names of the plant's heliostats; empty if the file has none.
     folder
-        Folder of the plant file, with the taught pictures.
+        Folder of the plant file, which contains the reference pictures.
     mechanism
         Nominal mechanisms of the heliostats named; None if the file has none, or several kinds.
     """
@@ -181,7 +181,7 @@ class Place:
 
 
 def open_place(path: Path) -> Place:
-    """Return targets, cameras and site of a plant, or of PAINT's tower file alone."""
+    """Return the targets, cameras and site of a plant, or of PAINT's tower file alone."""
     from heliotrope.errors import InputError
     from heliotrope.sun import Site
 
@@ -201,7 +201,7 @@ def open_place(path: Path) -> Place:
 
 
 def _files(paths: Sequence[Path]) -> tuple[list[Path], set[Path]]:
-    """Return the photographs, and which of those found in folders have other suffixes."""
+    """Return the photographs, and the files in folders that have other suffixes."""
     from heliotrope.errors import FormatError
     from heliotrope.imaging.files import IMAGE_SUFFIXES, OTHER_SUFFIXES, find_images
 
@@ -269,7 +269,7 @@ def _job(
 def _write(
     path: Path, outcomes: "Sequence[Outcome]", entries: "Sequence[Entry | None]", place: Place
 ) -> tuple[int, list[str]]:
-    """Write the table of sightings; return their number and a line for each omitted photograph."""
+    """Write the table of sightings; return their number and one line per omitted photograph."""
     import time
 
     from heliotrope.calibration.sighting_table import write_sightings
@@ -329,7 +329,7 @@ def _show(
 
 
 def print_spots(outcomes: "Sequence[Outcome]") -> None:
-    """Print the spots of photographs, target by target."""
+    """Print the spots in photographs, target by target."""
     for outcome in outcomes:
         print(outcome.path.name)
         readings = outcome.document["targets"]
@@ -374,23 +374,23 @@ def follow(
     memory: Path | None = None,
     as_json: bool = False,
 ) -> int:
-    """Read every frame of a source and print its spots; return the number of frames.
+    """Read every frame of a source and print the frame's spots; return the number of frames.
 
     Parameters
     ----------
     source
-        Frames.
+        Source of the frames.
     job
-        How to read them.
+        Settings for evaluating the frames.
     burst
         Number of frames averaged into one.
     archive
         Folder for frames and their results.
     memory
-        Folder of models of the empty targets: they are used, learn from every frame, and are
-        kept for the next time.
+        Folder of models of the empty targets. The models are used, are updated with every frame,
+        and are saved for the next time.
     as_json
-        Print one JSON document per line.
+        Whether to print one JSON document per frame, each on its own line.
     """
     from heliotrope.errors import HeliotropeError
     from heliotrope.imaging.campaign import look
@@ -426,7 +426,7 @@ def follow(
 
 @contextmanager
 def _kept(known: "Memory", folder: Path | None) -> "Iterator[None]":
-    """Save the models at the end, even after Ctrl-C."""
+    """Save the models at the end of a block, even after Ctrl-C."""
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""``heliotrope parameters``: one heliostat in the parameters of Guo, Malan and this program."""
+"""``heliotrope parameters``: a heliostat's parameters in the models of Guo, Malan and ours."""
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -23,7 +23,7 @@ def parameters(
     ] = "guo",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Convert error parameters of an azimuth-elevation heliostat."""
+    """Convert the error parameters of an azimuth-elevation heliostat between models."""
     machine = _machine(source, _parsed(values))
     document = {"guo": _guo(machine), "heliotrope": _heliotrope(machine)}
     try:

@@ -1,4 +1,4 @@
-"""``heliotrope plan``: the measurements to make next, of some heliostats or of a whole field."""
+"""``heliotrope plan``: the next measurements of some heliostats or of a whole field."""
 
 import sys
 from dataclasses import dataclass
@@ -100,7 +100,7 @@ def plan(
         Path | None, typer.Option(help="File for the picture, .png, .svg or .pdf.")
     ] = None,
 ) -> None:
-    """Plan the measurements that reveal most: times, targets, and the beam error to expect."""
+    """Plan the most informative measurements: times, targets, and the expected beam error."""
     from heliotrope.calibration.plan.campaign import Timing
     from heliotrope.calibration.plan.fleets import fleets_of
     from heliotrope.calibration.plan.report import check_picture
@@ -150,7 +150,7 @@ class _PlanOrder:
 
     @property
     def seconds(self) -> tuple[float, float]:
-        """The time span, Unix seconds."""
+        """The time span, in Unix seconds."""
         return self.span[0].timestamp(), self.span[1].timestamp()
 
     @property
@@ -163,7 +163,7 @@ class _PlanOrder:
         print_json({"from": self.span[0], "to": self.span[1], **document})
 
     def print_files(self) -> None:
-        """Report which files were written."""
+        """Report which files have been written."""
         for what, path in (("table", self.csv), ("picture", self.picture)):
             if path is not None:
                 print(f"{what}: {path}")
@@ -204,7 +204,7 @@ def span_of(begin: str, end: str | None, days: float | None) -> tuple[datetime, 
 
 
 def targets_of(plant: "Plant", names: list[str] | None) -> "tuple[Target, ...]":
-    """Return the targets with given names, or all targets."""
+    """Return the targets with the given names, or all targets if there are no names."""
     targets = tuple(plant.target(name) for name in dict.fromkeys(names or ())) or plant.targets
     if not targets:
         raise InputError("this plant has no target; camera measurements need one")
@@ -212,7 +212,7 @@ def targets_of(plant: "Plant", names: list[str] | None) -> "tuple[Target, ...]":
 
 
 def made_so_far(plant: "Plant", path: Path | None) -> "Sightings | None":
-    """Return the sightings of a table, and report which were left out."""
+    """Return the sightings in a table, and report which measurements were omitted."""
     if path is None:
         return None
     from heliotrope.calibration.plausibility import judge_in

@@ -66,7 +66,8 @@ def simulate(
 ) -> None:
     """Run the real plant, clusters and local controllers in virtual time, with random faults.
 
-    Seventeen safety invariants and four of liveness are checked; the exit code is 1 if one breaks.
+    Seventeen safety invariants and four liveness invariants are checked; the exit code is 1 if one
+    is violated.
     """
     from heliotrope.files.text import write_text
     from heliotrope.twin.world.simulation import RunPlan

@@ -1,4 +1,4 @@
-"""``heliotrope sun``: position of the sun."""
+"""``heliotrope sun``: the position of the sun."""
 
 from typing import Annotated, Literal
 
@@ -39,7 +39,7 @@ def sun(
     ] = "spa",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Print the sun's position, and when it rises, culminates and sets."""
+    """Print the sun's position, and the times when it rises, culminates and sets."""
     import numpy as np
 
     from heliotrope import sun as solar

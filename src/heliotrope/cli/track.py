@@ -40,7 +40,7 @@ AimOption = Annotated[
 TargetOption = Annotated[str | None, typer.Option(help="Aim at the centre of this target.")]
 
 
-#: Largest distance from a target at which an aim counts as on it, m.
+#: Largest distance from a target at which an aim counts as on the target, m.
 _ON = 0.01
 _TAKE = "recommended pose; shading and blocking by other mirrors are not considered"
 _NEAREST = "the nearest pose: the beam does not reach its aim"
@@ -91,7 +91,7 @@ def track(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Print normal, joint angles and drive counts of both branches, or of a day."""
+    """Print the normal, joint angles and drive counts of both branches, or of a whole day."""
     import numpy as np
 
     from heliotrope import sun as solar
@@ -155,7 +155,7 @@ def track(
 
 
 def _opened(field: Path, place: str, calibration: Path | None) -> "Plant":
-    """Open a field at a site, "" for its own, with a calibration."""
+    """Return a field at a site ("" for its own site), with a calibration."""
     plant = open_plant(field, parse_site(place) if place else None)
     if calibration is None:
         return plant
@@ -188,13 +188,13 @@ def _check_sun(heliostat: str, vector: "np.ndarray", time: str) -> None:
 
 
 def _check_pose(heliostat: str, status: "TrackingStatus") -> None:
-    """Refuse an outcome without a pose that the heliostat can reach."""
+    """Refuse a result without a pose that the heliostat can reach."""
     if status.name in ("NOT_CONVERGED", "DEGENERATE", "BEHIND"):
         raise InputError(f"heliostat {heliostat}: {status.text}; choose another aim")
 
 
 def _sun_of(field: Path) -> "np.ndarray | None":
-    """Return the sun vector of a HelioK file, (3,); None for other files and if it has none."""
+    """Return the sun vector in a HelioK file, (3,); None if the file contains none."""
     if field.suffix.lower() != ".xml":
         return None
     from heliotrope.field.formats import heliok
@@ -205,7 +205,7 @@ def _sun_of(field: Path) -> "np.ndarray | None":
 
 
 def aim_of(plant: "Plant", heliostat: str, aim: str | None, target: str | None) -> Any:
-    """Return the aim from the options, else the heliostat's own, else the first target, (3,)."""
+    """Return the aim from the options, the heliostat or the first target, in this order, (3,)."""
     if aim is not None and target is not None:
         raise InputError("use --aim or --target, not both")
     if aim is not None:
@@ -221,7 +221,7 @@ def aim_of(plant: "Plant", heliostat: str, aim: str | None, target: str | None) 
 
 
 def _local_aim(plant: "Plant", heliostat: str, aim: str | None) -> Any:
-    """Return the point fixed to the mirror from --aim or the heliostat's own aim, (3,)."""
+    """Return the point fixed to the mirror, (3,), from --aim or from the heliostat's own aim."""
     if aim is not None:
         return parse_point(aim, "aim")
     own = plant[heliostat].aim
@@ -267,7 +267,7 @@ def check_front(plant: "Plant", heliostat: str, aim: Any, vertices: "np.ndarray"
 
 
 def _trace(heliostat: str, steps: "tuple[TraceStep, ...]", as_json: bool) -> None:
-    """Print the table of iterations in the form of HelioK's debug output."""
+    """Print the table of iterations in the format of HelioK's debug output."""
     import numpy as np
 
     if as_json:

@@ -1,4 +1,4 @@
-"""``heliotrope twin``: a simulated field as a program of its own."""
+"""``heliotrope twin``: a simulated field as a separate program."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -75,11 +75,11 @@ def twin(
     ] = "127.0.0.1:0",
     child: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
-    """Simulate a field that a plant reaches as a real one: over TCP, HTTP and files of sensors.
+    """Simulate a field that a plant reaches like a real one: over TCP, HTTP and sensor files.
 
-    It writes what the plant needs into a folder, and runs until Ctrl-C. The plant is then started
-    with heliotrope run FOLDER/plant.toml --clusters FOLDER/links.toml. A folder that is there
-    already is that of a field that ran before: it runs again.
+    The command writes the files that the plant needs into a folder, and runs until Ctrl-C. Start
+    the plant with heliotrope run FOLDER/plant.toml --clusters FOLDER/links.toml. If the folder
+    already exists, the field that ran before runs again.
     """
     from heliotrope.errors import InputError
     from heliotrope.twin.live.live import steps_every
@@ -127,7 +127,7 @@ def twin(
 
 
 def _run(program: "TwinProgram", *, child: bool) -> None:
-    """Run until Ctrl-C or SIGTERM; as a child, until its parent closes standard input."""
+    """Run until Ctrl-C or SIGTERM or, as a child process, until the parent closes its input."""
     import asyncio
     import signal
     import sys
@@ -180,7 +180,7 @@ def _address(text: str, option: str) -> tuple[str, int]:
 
 
 def _free(address: tuple[str, int]) -> tuple[str, int]:
-    """Return the address with a free port in place of 0."""
+    """Return an address with a free port in place of port 0."""
     import socket
 
     from heliotrope.errors import InputError

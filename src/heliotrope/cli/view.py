@@ -1,4 +1,4 @@
-"""``heliotrope view``: a heliostat's mechanism in three dimensions, moving through a day."""
+"""``heliotrope view``: a heliostat's mechanism moving through a day, in three dimensions."""
 
 from pathlib import Path
 from typing import Annotated
@@ -32,7 +32,7 @@ def view(
     time: Annotated[str, typer.Option(help="A time of day, ISO 8601 with a zone.")] = "now",
     every: Annotated[str, typer.Option(help="Time between poses: 5min, 30s.")] = "10min",
 ) -> None:
-    """Write a day of a heliostat as an animated 3D view."""
+    """Write a day of a heliostat's motion as an animated 3D view."""
     import numpy as np
 
     from heliotrope import plot

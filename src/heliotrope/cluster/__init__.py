@@ -1,9 +1,9 @@
-"""The cluster controller: the program that is the master of one bus with up to 32 heliostats.
+"""The cluster controller: the program that controls one bus with up to 32 heliostats.
 
 `Cluster` is the controller. It is built from a `ClusterConfig`, a bus, a link to the plant, a clock
 and a `TimeKeeper`. `SystemTime` is the time of this computer with the kernel's bound on its error;
-`Gpsd` reports the state of a satellite receiver. `Kept` stores what survives a restart: epoch and
-editions. `Turns` shares a bus between tasks.
+`Gpsd` reports the state of a satellite receiver. `Kept` stores the epoch and editions, which
+survive a restart. `Turns` shares a bus between tasks.
 
 Modules that need the extra ``control`` must be imported by name: ``config_file`` (`read_cluster`),
 ``serial_bus`` (`SerialBus`) and ``program`` (a cluster built from its file, `LocalCluster`).

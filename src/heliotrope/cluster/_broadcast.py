@@ -20,7 +20,7 @@ _QUALITIES = ("none", "gps", "holdover", "system")
 
 
 class Broadcast:
-    """Sends session, time and sun, and records the time that the local controllers have."""
+    """Sends session, time and sun vector, and records the time sent to the local controllers."""
 
     def __init__(
         self,
@@ -36,11 +36,11 @@ class Broadcast:
         self._offset: float | None = None  # GPS minus monotonic time, as last broadcast
 
     def bus_time(self) -> float | None:
-        """Return the GPS time of the local controllers in s, None if no time was sent."""
+        """Return the GPS time of the local controllers, s; None if no time has been sent."""
         return None if self._offset is None else self._clock.monotonic() + self._offset
 
     async def second(self, present: Time) -> None:
-        """Send the broadcasts of one second; ``present`` is the time now."""
+        """Send the broadcasts of one second; ``present`` is the current time."""
         now, exchange = self._clock.monotonic(), self._exchange
         sound = present.usable and not present.jumped
         if sound:

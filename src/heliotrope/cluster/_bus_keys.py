@@ -1,13 +1,13 @@
 """The bus key: local controllers join the cluster in a signed session, and receive keys.
 
 A local controller shows in its STATUS whether it has a key, and whether it wants a session signed
-over a number that it has drawn (`lcu.signing`). The cluster requests that number and the
+over a random number that it has drawn (`lcu.signing`). The cluster requests that number and the
 fingerprints of its keys, and sends the session (`meet`). Each second it also sends one local
 controller a key that it lacks, or retires an old one (`supply`): encrypted under the key of that
 local controller, and only while its heliostat is at rest.
 
 During a key change, the cluster signs with the old key until every local controller that responds
-has the new one. No order of events therefore costs a lease.
+has the new key. No lease is therefore lost, whatever the order of events.
 """
 
 import struct
@@ -41,7 +41,7 @@ _OWN = "their own keys are not in the cluster's key file, or differ from it"
 
 
 class _Held:
-    """What the cluster knows about the bus keys of one local controller."""
+    """The cluster's knowledge of the bus keys that one local controller holds."""
 
     def __init__(self, boots: int) -> None:
         self.boots = boots
@@ -59,12 +59,12 @@ class BusKeys:
     cluster
         Name of the cluster.
     ring
-        Bus keys, newest first. If empty, local controllers that have a key lose it. None: the
-        cluster signs nothing, and changes no key.
+        Bus keys, newest first. If empty, local controllers that have a key lose it. If None, the
+        cluster signs nothing and changes no key.
     nodes, exchange, reports, kept
         Parts of the cluster.
     clock
-        Function that returns monotonic s.
+        Function that returns the monotonic time, s.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class BusKeys:
     # -- the keys ----------------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Adopt keys that have changed, and decide which key signs."""
+        """Adopt changed keys and decide which key signs."""
         keys = () if self._ring is None else self._ring.keys
         if keys != self._taken:
             self._taken = keys
@@ -111,13 +111,13 @@ class BusKeys:
         )
 
     def _due(self, prints: tuple[int, int]) -> bytes | None:
-        """Return the key to be set in a node that holds these keys; None: its keys are correct."""
+        """Return the key that a node with these keys lacks; None if the node needs no key."""
         newest, old = prints
         if not self._keys:
             return NO_KEY if newest else None
         keys = list(self._keys)
         if newest not in keys and old not in keys:
-            return self._keys[keys[-1]]  # the one that signs now
+            return self._keys[keys[-1]]  # the key that signs now
         if newest != keys[0] or (len(keys) == 1 and old):
             return self._keys[keys[0]]
         return None
@@ -165,7 +165,7 @@ class BusKeys:
     # -- keys for local controllers ----------------------------------------------------------
 
     async def supply(self) -> None:
-        """Send one local controller the key that is due, and report nodes that lack their keys."""
+        """Send one local controller the key that it lacks; report nodes that lack their keys."""
         if self._ring is not None and self._exchange.connected:
             for node in sorted(self._nodes, key=lambda node: self._waited(node.index)):
                 held = self._held.get(node.index)

@@ -1,7 +1,7 @@
-"""Frames on the bus, recorded at the plant's request: for a limited time and number.
+"""Recording of bus frames at the plant's request, for a limited time and number of frames.
 
-`RecordedBus` sits between the cluster and its port. It adds no delay and writes no file: during a
-recording, each frame costs one list entry; otherwise nothing.
+`RecordedBus` sits between the cluster and its port. It adds no delay and writes no file: each frame
+costs one list entry during a recording, and nothing otherwise.
 """
 
 import struct
@@ -11,8 +11,8 @@ from heliotrope.links.clock import Clock
 from heliotrope.links.link import Bus, SendOutcome
 from heliotrope.links.messages import BUS_ENTRY, BUS_RECEIVED, BUS_SENT
 
-#: Limits of a recording: this time, s; this many entries; and this size, bytes, because a message
-#: on a link has at most 64 KiB.
+#: Limits of a recording: its duration, s, its number of entries, and its size, bytes, because a
+#: message on a link has at most 64 KiB.
 LONGEST, MOST, LARGEST = 5.0, 500, 48 * 1024
 
 
@@ -24,7 +24,7 @@ class RecordedBus:
     bus
         The port; its owner runs it.
     clock
-        Times the entries.
+        Clock that supplies the times of the entries.
     """
 
     def __init__(self, bus: Bus, clock: Clock) -> None:
@@ -39,7 +39,7 @@ class RecordedBus:
 
     @property
     def recording(self) -> bool:
-        """Whether a recording has begun and has not been collected."""
+        """Whether a recording has begun and has not yet been collected."""
         return self._began is not None
 
     @property
@@ -55,7 +55,7 @@ class RecordedBus:
         self._entries, self._size, self._full = [], 0, ""
 
     def taken(self) -> tuple[float, str, bytes]:
-        """End the recording; return its beginning (POSIX s), why it ended, and its entries."""
+        """End the recording; return its start (POSIX s), its reason for ending, and its entries."""
         record = self._utc_s, self._full or f"{LONGEST:g} s are over", b"".join(self._entries)
         self._began, self._entries = None, []
         return record
@@ -79,7 +79,7 @@ class RecordedBus:
 
     @property
     def closed(self) -> bool:
-        """Whether the bus is closed for good."""
+        """Whether the bus is closed permanently."""
         return self._bus.closed
 
     async def run(self) -> None:
@@ -87,13 +87,13 @@ class RecordedBus:
         await self._bus.run()
 
     async def close(self) -> None:
-        """Close the bus for good."""
+        """Close the bus permanently."""
         await self._bus.close()
 
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
     ) -> SendOutcome:
-        """Send a frame that gets no reply; see `SerialBus.transmit`."""
+        """Send a frame that expects no reply; see `SerialBus.transmit`."""
         begin = self._clock.monotonic()
         outcome = await self._bus.transmit(frame, expires=expires, urgent=urgent)
         if outcome is SendOutcome.SENT:

@@ -1,4 +1,4 @@
-"""Discovery of local controllers by serial number, halving ranges when replies collide.
+"""Discovery of local controllers by serial number; ranges are halved when replies collide.
 
 All controllers with a serial number in a range reply in randomly chosen slots. If two reply at
 once, the bytes are damaged, and each half of the range is polled separately. A range is finished
@@ -24,7 +24,7 @@ _GARBLED = 4
 
 @dataclass(frozen=True)
 class HereAnswer:
-    """The reply of a local controller."""
+    """The reply of a local controller to a discovery query."""
 
     serial: int
     firmware: int
@@ -40,7 +40,7 @@ class _Range:
 
 
 def heard(data: bytes, sequence: int) -> tuple[list[HereAnswer], bool]:
-    """Return the replies to a query, and whether other bytes were received."""
+    """Return the replies to a query, and whether any other bytes were received."""
     reader = wire.Reader()
     # A zero byte terminates a frame that was cut off.
     frames = reader.feed(data + b"\0")
@@ -54,7 +54,7 @@ def heard(data: bytes, sequence: int) -> tuple[list[HereAnswer], bool]:
 
 
 class Discovery:
-    """One search of the bus, query by query.
+    """One search of the bus, which proceeds query by query.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class Discovery:
                 self._ranges.pop()
 
     def result(self) -> dict[str, Any]:
-        """Return the controllers found, each with its name, if it has one, and expected address.
+        """Return the controllers found, each with its name, if any, and its expected address.
 
         ``missing`` names configured heliostats that did not reply; ``garbled`` lists serial numbers
         whose replies were always damaged (two controllers share the number).

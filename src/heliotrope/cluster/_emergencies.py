@@ -1,9 +1,9 @@
 """DEFOCUS and STOW: broadcast three times, then confirmed by each heliostat.
 
-Anyone can order them, and so can the safety table. They take precedence over all other bus traffic.
-A heliostat that has not acknowledged is reported by name, and polled every second until it has. The
-cluster itself issues the first order at start-up: a DEFOCUS of everything on the bus, which needs
-no acknowledgement.
+Anyone can order DEFOCUS and STOW, and so can the safety table. These orders take precedence over
+all other bus traffic. A heliostat that has not acknowledged the order is reported by name, and
+polled every second until it has. The cluster itself issues the first order at start-up: a DEFOCUS
+of all heliostats on the bus, which needs no acknowledgement.
 """
 
 from collections import deque
@@ -48,12 +48,12 @@ def _rank(order: _Order) -> tuple[bool, bool, bool]:
 
 
 class Emergencies:
-    """Emergencies that not all heliostats have acknowledged.
+    """Emergency orders that not all heliostats have acknowledged.
 
     Attributes
     ----------
     pressing
-        Whether an emergency must be sent before anything else.
+        Whether an emergency order must be sent before anything else.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Emergencies:
         self.pressing = True
 
     def begin(self, identity: str, name: str, nodes: list[ClusterNode]) -> None:
-        """Accept an emergency for some or all heliostats; a repeated order counts once."""
+        """Accept an emergency order for some or all heliostats; a repeated order counts once."""
         if identity and any(order.identity == identity for order in self._orders):
             return
         everybody = len(nodes) == len(self._nodes)
@@ -90,9 +90,9 @@ class Emergencies:
     async def serve(self) -> None:
         """Broadcast and query until every order has had its round.
 
-        Orders not sent at all go first, and among these the orders for heliostats that reply. Once
-        this has used up the time budget of an order, silent heliostats wait for the next second, so
-        that many orders on a dead bus take no longer than a few.
+        Orders that were never sent go first, and among these the orders for heliostats that reply.
+        Once these rounds have used up the time budget of an order, silent heliostats wait for the
+        next second, so that many orders on a dead bus take no longer than a few.
         """
         self._serving = self._clock()
         self._asked.clear()
@@ -115,7 +115,7 @@ class Emergencies:
         self.pressing = bool(self._orders)
 
     def waits(self, node: ClusterNode) -> bool:
-        """Whether a node has yet to acknowledge an order."""
+        """Return whether a node has yet to acknowledge an order."""
         return any(node in order.waiting for order in self._orders)
 
     async def _call(self, order: _Order) -> None:
@@ -150,12 +150,12 @@ class Emergencies:
         order.new = False
 
     def _later(self, order: _Order, node: ClusterNode, number: int) -> bool:
-        """Whether a node is left out of a round of the order."""
+        """Return whether a node is left out of this round of the order."""
         if order.given_up and node.missed > 0:
-            return True  # polling finds it when it comes back
+            return True  # polling finds the node when it comes back
         if node.missed < _SILENT:
             return False
-        # Another order may have requested the same from it.
+        # Another order may have requested the same state from the node.
         if order.new:
             enough = order.tries[node.index] > number
         else:
@@ -194,7 +194,7 @@ class Emergencies:
             self._goals.begin(order.identity, order.name, node, self._clock())
 
     def _name(self, order: _Order, now: float) -> None:
-        """Report the nodes that have not acknowledged in time."""
+        """Report the nodes that have not acknowledged in time by name."""
         age = now - order.began
         if age <= ORDER_BUDGET:
             return

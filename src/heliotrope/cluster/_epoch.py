@@ -9,30 +9,30 @@ from heliotrope.cluster.timekeeping import Time
 from heliotrope.safety import alarms
 
 #: A new epoch begins after this many consecutive unexplained "duplicate" replies to commands,
-#: counted over all local controllers or for one alone. For one alone, it begins at most once in so
-#: many seconds, because a new epoch voids the commands under way to all.
+#: counted over all local controllers or for one alone. For one alone, it begins at most once in
+#: this many seconds, because a new epoch voids all commands in transit.
 _OUT_OF_STEP, _REST = 3, 30
 
 
 class Epoch:
-    """Begins epochs, and judges from the replies of local controllers when a new one is needed.
+    """Begins epochs, and decides from the local controllers' replies when a new one is needed.
 
     Parameters
     ----------
     kept
         Storage in which the epoch survives a restart.
     exchange
-        Sends under the epoch.
+        Sends frames under the epoch.
     reports
         Receives alarms.
     present
-        The time at the start. Without a state file only the time makes the epoch higher than that
-        of any earlier run.
+        The time at the start. Without a state file, only the time ensures that the epoch is higher
+        than in any earlier run.
 
     Attributes
     ----------
     kept
-        As given.
+        Storage of the epoch.
 
     Raises
     ------
@@ -51,12 +51,12 @@ class Epoch:
         exchange.begin_epoch(kept.start(int(present.gps_s) if self._of_time else 0))
 
     def taken(self, place: int) -> None:
-        """Note that a local controller has accepted a command, so it is in step."""
+        """Record that a local controller has accepted a command, so its numbering is in step."""
         self._duplicates = 0
         self._of_one.pop(place, None)
 
     def duplicate(self, place: int) -> None:
-        """Note that a local controller replied "duplicate" to a new command.
+        """Record that a local controller replied "duplicate" to a new command.
 
         A single local controller is out of step after another sender has used the cluster's address
         with a later number.
@@ -65,7 +65,7 @@ class Epoch:
         self._of_one[place] += 1
 
     def second(self) -> None:
-        """Begin a new epoch if the local controllers are out of step, or use one that is stored."""
+        """Begin a new epoch if local controllers are out of step, or begin using a stored one."""
         self._rest = max(0, self._rest - 1)
         single = max(self._of_one.values(), default=0) >= _OUT_OF_STEP and not self._rest
         if single:
@@ -81,7 +81,7 @@ class Epoch:
         self._use()
 
     def _begin(self, at_least: int) -> None:
-        """Have a new epoch stored; until it is, the present one continues."""
+        """Have a new epoch stored; until then, the present epoch continues."""
         if self._storing or self._next is not None:
             return
         self._storing, self._duplicates = True, 0
@@ -99,7 +99,10 @@ class Epoch:
         self.kept.begin(at_least, stored)
 
     def _use(self) -> None:
-        """Begin the stored epoch; only before SESSION, which sends it to local controllers."""
+        """Put the stored epoch into use.
+
+        This happens only before SESSION, which sends the epoch to the local controllers.
+        """
         if self._next is not None:
             self._exchange.begin_epoch(self._next)
             self._next = None

@@ -1,4 +1,4 @@
-"""Queries and commands on the bus, counted for each local controller; one at a time."""
+"""Queries and commands on the bus, one at a time, counted for each local controller."""
 
 import asyncio
 import hashlib
@@ -26,7 +26,7 @@ def sha256(data: bytes) -> bytes:
 
 
 class NodeAnswer(NamedTuple):
-    """A reply: its name, its values, and the number of earlier attempts without a reply."""
+    """A reply: its name, its values, and the number of preceding attempts without a reply."""
 
     name: str
     values: tuple[Any, ...]
@@ -41,16 +41,16 @@ class Exchange:
     bus
         The port, run by its owner.
     clock
-        Clock of the bus's expiries.
+        Clock for the expiries of frames.
     answer, stored_answer
-        Time limit of a complete reply, s; the same if flash is written before the reply.
+        Time limit for a complete reply, s; time limit if flash is written before the reply, s.
 
     Attributes
     ----------
     sender
-        Makes and numbers the frames.
+        Creates and numbers the frames.
     clock
-        As given.
+        Clock for the expiries of frames.
     now
         When the last poll ended, monotonic s.
     """
@@ -77,14 +77,14 @@ class Exchange:
         self.sender.sign = self._sign
 
     def sign(self, sign: Sign | None) -> None:
-        """Sign frames from now on (see `lcu.signing`); None: sign nothing."""
+        """Sign frames from now on (see `lcu.signing`); with None, sign no frame."""
         self._sign = self.sender.sign = sign
 
     def token(self, token: int) -> int:
-        """Return the wire's token for a token of the command authority.
+        """Return the bus token for a token of the command authority.
 
-        It changes with the epoch, so that commands from before a restart, which may arrive late,
-        are void although the same authority still commands.
+        The bus token changes with the epoch, so that commands from before a restart, which may
+        arrive late, are void although the same authority still commands.
         """
         if token == 0:
             return 0
@@ -103,11 +103,11 @@ class Exchange:
         await self.transmit(self.sender.session(self.token(token)))
 
     async def send_session(self, address: int, token: int, number: bytes, sign: Sign) -> None:
-        """Begin a signed session with one local controller, over the number that it drew."""
+        """Begin a signed session with a local controller, over the random number that it drew."""
         await self.transmit(self.sender.session_to(address, self.token(token), number, sign))
 
     async def transmit(self, frame: bytes, *, life: float = 0.5, urgent: bool = False) -> bool:
-        """Send a frame that gets no reply, within ``life`` s; return whether it was sent."""
+        """Send a frame within ``life`` s, expecting no reply; return whether it was sent."""
         expires = self.clock.monotonic() + life
         outcome = await self._bus.transmit(frame, expires=expires, urgent=urgent)
         return outcome is SendOutcome.SENT
@@ -115,7 +115,10 @@ class Exchange:
     async def poll(
         self, node: ClusterNode, question: Question, sequence: int, begin: float
     ) -> tuple[Any, ...] | None:
-        """Query a node at ``begin``, and return the values of its reply or None; sets ``now``."""
+        """Query a node at time ``begin``.
+
+        Return the values of the reply, or None if there was none, and set ``now``.
+        """
         node.asked()
         self._asked += 1
         data = await self._bus.transact(question.frame(node.address, sequence), self._answer)
@@ -143,9 +146,9 @@ class Exchange:
         tries: int = 1,
         urgent: bool = False,
     ) -> NodeAnswer | None:
-        """Send a message to a node, repeat the same frame if no reply comes, and return the reply.
+        """Send a message to a node, repeating the frame while no reply comes; return the reply.
 
-        ``stored``: flash is written before the reply.
+        ``stored`` means that flash is written before the reply.
 
         A frame that is repeated before any other frame is created takes effect once. If the node
         has already accepted it, the node replies "duplicate".
@@ -185,9 +188,9 @@ class Exchange:
         stored: bool = False,
         complete: Callable[[bytes], bool] = lambda _: False,
     ) -> tuple[bytes | None, int]:
-        """Query all nodes; return the bytes that arrive within ``span`` s, and the sequence number.
+        """Query all nodes; return the bytes received within ``span`` s, and the sequence number.
 
-        None in place of the bytes if `interrupt` was called in the meantime. ``stored``: flash is
+        The bytes are None if `interrupt` was called in the meantime. ``stored`` means that flash is
         written before the reply.
         """
         span += self._stored_answer if stored else 0.0
@@ -202,7 +205,7 @@ class Exchange:
         expires: float | None,
         complete: Callable[[bytes], bool] | None,
     ) -> bytes | None:
-        """Run a transaction that may take long; None if `interrupt` was called in the meantime."""
+        """Run a transaction that may take long; return None if `interrupt` was called meanwhile."""
         try:
             async with asyncio.timeout(None) as self._gathering:
                 return await self._bus.transact(frame, timeout, expires=expires, complete=complete)
@@ -212,7 +215,7 @@ class Exchange:
             self._gathering = None
 
     def interrupt(self) -> None:
-        """Abort long transactions and repeat nothing until `resume`, because an emergency waits."""
+        """Abort long transactions and repeat no frame until `resume`: an emergency is waiting."""
         self._hurry = True
         if self._gathering is not None:
             self._gathering.reschedule(asyncio.get_running_loop().time())
@@ -223,13 +226,13 @@ class Exchange:
 
     def _spoilt(self, node: ClusterNode, data: bytes, now: float) -> None:
         node.spoilt(data)
-        # The silence of a node that is switched off proves nothing about the bus; damaged bytes
+        # The silence of a node that is switched off says nothing about the bus; damaged bytes
         # always do.
         if data or now - node.heard_at <= _WINDOW:
             self._bad += 1
 
     def second(self) -> float:
-        """End a second, and return the share of bad frames in the last ten seconds."""
+        """End a second and return the fraction of bad frames in the last ten seconds."""
         if not self.connected:
             self._seconds.clear()
             self._asked = self._bad = self._answered = 0

@@ -29,7 +29,8 @@ _ALL = frozenset(range(len(states.STATES)))
 _BEAM_OFF = _ALL.difference(states.BEAM_OUT)
 
 
-#: A STATUS requested sooner after the ACK may not show the motion yet, s: a few ticks of a board.
+#: A STATUS requested sooner than this after the ACK may not show the motion yet, s: a few ticks of
+#: a board.
 _SETTLE = 0.2
 #: Step counts this close to their goal have reached it, because the sun moves them by this much in
 #: a few ticks.
@@ -40,23 +41,24 @@ _LONGEST = 900.0
 
 @dataclass(frozen=True)
 class Goal:
-    """States that a command leads to, and states on the way there.
+    """The states that a command requests, and the states on the way there.
 
     Attributes
     ----------
     goal_states, on_way
-        States.
+        Requested states; states on the way there.
     clear, needed
-        Flags that must be clear, and set, in one of ``there``; until then it is on its way.
+        Flags that must be clear, and flags that must be set, in one of ``goal_states``; until then
+        the heliostat is on its way.
     near
         Whether the step counts must be near their goal. A defocused heliostat keeps its beam beside
         the receiver as the sun moves, so it never stands still.
     evidence
         States and flags, any of which shows that the command was accepted. They are needed if the
-        reply was lost and the goal looks like the state before the command. None: the goal itself
-        shows it.
+        reply was lost and the goal looks like the state before the command. If None, the goal
+        itself shows the acceptance.
     limit
-        Time allowed to get there, s.
+        Time allowed until the goal is reached, s.
     """
 
     goal_states: frozenset[int]
@@ -68,7 +70,7 @@ class Goal:
     limit: float = _LONGEST
 
     def reached(self, state: int, flags: int, off: int) -> bool | None:
-        """Return True if the goal is reached, None if it is on the way, False if neither.
+        """Return True if the goal is reached, None if the heliostat is on its way, otherwise False.
 
         ``off`` is the distance of the step counts from their goal.
         """
@@ -78,7 +80,7 @@ class Goal:
         return None if state in self.on_way else False
 
     def shown(self, state: int, flags: int) -> bool:
-        """Whether state and flags show that the command was accepted."""
+        """Return whether state and flags show that the command was accepted."""
         return self.evidence is None or state in self.evidence[0] or bool(flags & self.evidence[1])
 
 
@@ -127,7 +129,7 @@ class Shift:
     steps: int
 
     def shown(self, goals: tuple[int, int]) -> bool:
-        """Whether only the command can explain the present goals."""
+        """Return whether only the command can explain the present goals."""
         off = abs(goals[self.axis] - self.origin - self.steps)
         # The sun moves the goals as well, until the command ends tracking.
         return off == 0 or (off <= _NEAR and abs(self.steps) > 2 * _NEAR)
@@ -159,9 +161,9 @@ class Goals:
         sure: bool = True,
         shift: Shift | None = None,
     ) -> None:
-        """Begin the goal of a command that a node acknowledged; other goals are void (see `end`).
+        """Begin the goal of a command that a node acknowledged; this voids other goals (see `end`).
 
-        Not ``sure``: the reply was lost, and ``shift``, if known, shows whether the command was
+        If not ``sure``, the reply was lost; ``shift``, if known, then shows whether the command was
         accepted.
         """
         if name not in GOALS:
@@ -172,20 +174,20 @@ class Goals:
         self._watches[node.index] = [*others, _Watch(identity, name, now, sure, shift)]
 
     def waits(self, node: ClusterNode) -> bool:
-        """Whether a node has a goal."""
+        """Return whether a node has a goal."""
         return node.index in self._watches
 
     def end(self, node: ClusterNode, why: str, name: str) -> None:
         """Abandon the goals of a node.
 
-        Goals of an order of the same ``name`` remain, because the heliostat goes there anyway; a
-        STOW also remains when DEFOCUS comes.
+        Goals of an order of the same ``name`` remain, because the heliostat reaches them anyway.
+        The goal of a STOW also remains when a DEFOCUS arrives.
         """
         spared = (name, *_SPARED.get(name, ()))
         self._judge(node, lambda watch: None if watch.name in spared else why)
 
     def heard(self, node: ClusterNode, asked_at: float) -> None:
-        """Evaluate a node's STATUS and STEPS; STATUS was requested at ``asked_at``."""
+        """Evaluate a node's STATUS and STEPS; its STATUS was requested at ``asked_at``."""
         watches = self._watches.get(node.index)
         if watches is None:
             return
@@ -212,7 +214,10 @@ class Goals:
             self._watches.pop(node.index, None)
 
     def _verdict(self, node: ClusterNode, watch: _Watch, asked_at: float) -> str | None:
-        """Return the reason for a failure, an empty text if it is done, None if it is under way."""
+        """Return the reason for a failure.
+
+        The reason is empty if the goal is reached, and None while the heliostat is on its way.
+        """
         if asked_at < watch.since + _SETTLE:
             return None
         if watch.name in messages.SAFE and node.flags & names.COUNTS_UNKNOWN:

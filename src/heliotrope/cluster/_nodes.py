@@ -1,7 +1,7 @@
-"""The cluster's view of its local controllers, and fast parsing of replies.
+"""The cluster's records of its local controllers, and fast parsing of replies.
 
 Each local controller is polled once or twice per second, so the query frames are created once, and
-a reply of the expected size is parsed with one call of ``struct``. Anything else goes through
+a reply of the expected size is parsed with one call of ``struct``. All other bytes go through
 `wire.Reader`, which decides; the fast parser accepts nothing that `wire.Reader` would reject. A
 reply carries the sequence number of its query, and consecutive queries to a node have different
 numbers, so a reply that arrives late (by many seconds, from a network serial server) is not
@@ -35,7 +35,7 @@ class OrderRefusedError(Exception):
 
 
 class Question:
-    """A query without values, and the fast parsing of its reply."""
+    """A query without values, with a fast parser for its reply."""
 
     def __init__(self, name: str, answer: str) -> None:
         self.number = messages.NUMBER_OF[name]
@@ -55,7 +55,7 @@ class Question:
         return frame
 
     def read(self, data: bytes, address: int, sequence: int) -> tuple[Any, ...] | None:
-        """Return the reply's values if the bytes are exactly that reply, else None.
+        """Return the values of the reply, or None unless the bytes are exactly that reply.
 
         COBS is decoded in place: as long as no block is full, each of its codes stands for one
         zero.
@@ -97,13 +97,14 @@ class Counts:
     Attributes
     ----------
     asked, answered
-        Queries; replies.
+        Number of queries; number of replies.
     late, corrupt, silent
-        Queries without their own reply: the reply to another query arrived; damaged bytes; nothing.
+        Queries without their own reply because the reply to another query arrived, because bytes
+        were damaged, or because nothing arrived.
     retries
         Frames sent again.
     round_trip, longest
-        Time from query to complete reply, s: the last, and the longest.
+        Time from query to complete reply, s: the last and the longest.
     """
 
     asked: int = 0
@@ -122,15 +123,15 @@ class ClusterNode:
     Attributes
     ----------
     member, index
-        As configured.
+        Heliostat and index as configured.
     counts
         See `Counts`.
     status, steps
         Values of the last STATUS and STEPS.
     status_at, steps_at
-        When they were requested, monotonic s; -inf: never. The reply may have been read later.
+        When they were requested, monotonic s; -inf if never. The reply may have been read later.
     heard_at
-        When it last replied to anything, monotonic s; -inf: never.
+        When it last replied to any message, monotonic s; -inf if never.
     follow_until
         End of the time in which its step counts are requested each second, monotonic s.
     missed
@@ -155,7 +156,7 @@ class ClusterNode:
 
     @property
     def known(self) -> bool:
-        """Whether its state was received since start-up; if not, ``state`` means nothing."""
+        """Whether a state was received since start-up; otherwise ``state`` is meaningless."""
         return self.status_at > -math.inf
 
     @property
@@ -182,16 +183,16 @@ class ClusterNode:
         self.steps, self.steps_at = steps, asked_at
 
     def follow(self, until: float) -> None:
-        """Request its step counts each second until a monotonic time."""
+        """Request step counts each second until a monotonic time."""
         self.follow_until = max(self.follow_until, until)
 
     def asked(self, *, again: bool = False) -> None:
-        """Count a query; ``again``: its frame was sent before."""
+        """Count a query; ``again`` means that its frame was sent before."""
         self.counts.asked += 1
         self.counts.retries += again
 
     def retried(self) -> None:
-        """Count a query that will be sent again."""
+        """Count a query that will be repeated."""
         self.counts.retries += 1
 
     def answered(self, now: float, took: float) -> None:
@@ -204,7 +205,7 @@ class ClusterNode:
         self.missed = 0
 
     def spoilt(self, data: bytes) -> None:
-        """Count bytes that were received in place of a reply."""
+        """Count bytes that arrived in place of a reply."""
         self.missed += 1
         if not data.strip(b"\0"):
             self.counts.silent += 1
@@ -264,7 +265,7 @@ class Nodes:
         Raises
         ------
         OrderRefusedError
-            A name that does not belong to this cluster.
+            If a name does not belong to this cluster.
         """
         node = self._by_name.get(name)
         if node is None:
@@ -272,7 +273,7 @@ class Nodes:
         return node
 
     def chosen(self, heliostats: Iterable[str]) -> tuple[list[ClusterNode], dict[str, str]]:
-        """Return heliostats by name, all if none is named, and the refusals of unknown names."""
+        """Return heliostats by name, or all if none is named, and the refusals of unknown names."""
         names = dict.fromkeys(heliostats)
         nodes, refused = list[ClusterNode](), dict[str, str]()
         for name in names:
@@ -293,7 +294,7 @@ class Nodes:
 def answer_in(
     data: bytes, address: int, sequence: int, numbers: tuple[int, ...]
 ) -> wire.Frame | None:
-    """Return the reply to a query from received bytes, None if they hold no such reply."""
+    """Return the reply to a query from received bytes; None if they contain no such reply."""
     for frame in wire.Reader().feed(data):
         if (
             frame.to == wire.CLUSTER_ADDRESS

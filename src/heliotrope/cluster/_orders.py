@@ -1,10 +1,10 @@
 """Commands and parameters on their way to the heliostats: sent, retried, checked, reported.
 
-A command without a reply is sent again as the same frame, which takes effect only once, and in the
-next second as a new frame, until it expires. If the reply to an earlier frame was lost, "duplicate"
-or "not in this state" may mean that the command was accepted; the reported state then decides. A
-command that must not take effect twice (JOG) is not sent as a new frame; the step-count goals show
-whether it was accepted.
+A command without a reply is sent again as the same frame, which takes effect only once. In the next
+second it is sent as a new frame, until it expires. If the reply to an earlier frame was lost,
+"duplicate" or "not in this state" may mean that the command was accepted; the reported state then
+decides. A command that must not take effect twice (JOG) is not sent as a new frame; the step-count
+goals show whether it was accepted.
 """
 
 import re
@@ -31,20 +31,20 @@ _RELATIVE = messages.having("relative")
 _REPEATED = messages.having("again")
 _STORED = messages.having("stored")
 
-#: The same frame is sent this often before other jobs get their turn.
+#: Number of times that a frame is sent before other jobs get their turn.
 TRIES = 3
 #: Temporary refusals: the node has not yet received the time, session or authority.
 _AGAIN = (messages.DUPLICATE, messages.EXPIRED, messages.REFUSED_AUTHORITY)
 #: Refusals that may mean that an earlier frame was accepted and its reply lost.
 _MAYBE = (messages.DUPLICATE, messages.REFUSED_STATE, messages.BUSY)
-#: Limit for all heliostats together; the bus carries about a hundred a second.
+#: Maximum number of jobs for all heliostats; the bus carries about a hundred per second.
 _MOST_JOBS = 2048
 #: If at most this many heliostats are commanded at a time, their step counts are requested each
 #: second for this long, s.
 _FEW, FOLLOWED = 4, 60.0
 #: Commands that may move a heliostat, refused while a row of the safety table forbids motion.
 MOTIONS = messages.MOTIONS | messages.POINTS
-#: A command's life on the wire, s: less than a local controller accepts by its clock.
+#: Lifetime of a command on the bus, s; it is shorter than a local controller's clock allows.
 _WIRE_LIFE = wire.HORIZON_S - 2.0
 _ITEM_NUMBER = {row[0]: number for number, row in enumerate(ITEMS, 1)}
 #: The message that sets an item, and the axis if the item exists for both axes.
@@ -57,7 +57,7 @@ _MESSAGE_OF = {
 
 @dataclass(frozen=True)
 class Step:
-    """One message of an order or, if ``item`` is given, the check of a stored item."""
+    """One message of an order or, if ``item`` is set, the check of a stored item."""
 
     name: str
     values: tuple[Any, ...] = ()
@@ -86,16 +86,16 @@ class NodeOrder:
         self.unanswered = False  # an earlier frame of this step may have been accepted
         self.edition = -1  # of the node's journal; -1: not yet known
         self.last = ""  # reason of the last retry
-        self.void = ""  # reason to abandon it once its frame is answered
-        self.origin: tuple[int, int] | None = None  # step-count goals before it, if known
+        self.void = ""  # reason to abandon the job once its frame is answered
+        self.origin: tuple[int, int] | None = None  # step-count goals before the job, if known
 
     @property
     def step(self) -> Step:
-        """The present step."""
+        """The step that is carried out now."""
         return self.order.steps[self.place]
 
     def shift(self) -> Shift | None:
-        """The change that a JOG makes; None: unknown."""
+        """The change made by a JOG; None if it is unknown."""
         if self.origin is None:
             return None
         axis, steps = self.step.values
@@ -110,7 +110,7 @@ class Orders:
     nodes, exchange, goals, reports, watch, epoch
         Parts of the cluster.
     gps
-        Function that returns the GPS time of the local controllers in s, None if they have none.
+        Function that returns the GPS time of the local controllers, s; None if they have no time.
     look
         Function that polls the state of a node.
     """
@@ -135,13 +135,13 @@ class Orders:
 
     @property
     def ready(self) -> bool:
-        """Whether something can be sent now."""
+        """Whether a message can be sent now."""
         return bool(self._ready)
 
     # -- accepting -------------------------------------------------------------------------
 
     def accept(self, command: Command, nodes: list[ClusterNode]) -> None:
-        """Accept a command for some of its heliostats, or refuse it."""
+        """Accept a command for some of its heliostats, or refuse the command."""
         try:
             steps = self._steps_of(command, nodes)
             self._may(command.token, command.lifetime, len(nodes))
@@ -227,7 +227,7 @@ class Orders:
         self._ready.append(NodeOrder(order, node))
 
     def _supersede(self, order: Order, node: ClusterNode) -> None:
-        """Abandon an earlier point of a node, which would arrive after the new one if retried."""
+        """Abandon an earlier point of a node, whose retry would arrive after the new point."""
         why = f"superseded by another {order.name}"
 
         def earlier(job: NodeOrder) -> bool:
@@ -245,7 +245,7 @@ class Orders:
     # -- time ------------------------------------------------------------------------------
 
     def second(self) -> None:
-        """Make jobs that are to be retried ready again."""
+        """Make jobs ready that are to be retried."""
         self._ready.extend(self._later)
         self._later.clear()
 
@@ -265,7 +265,7 @@ class Orders:
     # -- sending ---------------------------------------------------------------------------
 
     async def serve(self) -> None:
-        """Do one step of one job."""
+        """Carry out one step of one job."""
         self._at_work = self._ready.popleft()
         await self._work(self._at_work)
         self._at_work = None
@@ -290,7 +290,7 @@ class Orders:
         return await self._set(job)
 
     async def _note_origin(self, job: NodeOrder) -> None:
-        """Query the step-count goals: if the reply is lost, they show what was done."""
+        """Query the step-count goals, which show what was done if the reply is lost."""
         node, asked_at = job.node, self._clock()
         node.follow(asked_at + FOLLOWED)
         await self._look(node)
@@ -335,7 +335,7 @@ class Orders:
         return self._again(job, f"no reply to {step.name} before the command expired")
 
     async def _give_address(self, job: NodeOrder, head: tuple[int, ...], key: bytes) -> None:
-        """Broadcast to an unknown address; then query the node by its serial number."""
+        """Assign an address to a serial number by broadcast, then query the node."""
         serial, address = job.step.values
         frame = self._exchange.sender.frame(
             wire.BROADCAST, "SET_ADDRESS", *head, serial, address, key=key
@@ -367,7 +367,7 @@ class Orders:
         return int(gps + life) & 0xFFFFFFFF
 
     async def _knows_edition(self, job: NodeOrder) -> bool:
-        """Query the edition of the node's journal, because another cluster may have written it."""
+        """Query the edition of the node's journal, since another cluster may have written it."""
         if job.edition < 0:
             data = await self._stored(job, "edition")
             if data is None:
@@ -379,7 +379,7 @@ class Orders:
         return await stored(self._exchange, job.node, item, job.order.deadline)
 
     async def _check(self, job: NodeOrder) -> None:
-        """Compare the stored item, and the checksum in STATUS."""
+        """Compare the stored item with the sent item, and check the checksum in STATUS."""
         step, node = job.step, job.node
         data = await self._stored(job, step.item)
         if data is None:
@@ -400,7 +400,7 @@ class Orders:
         return self._advance(job)
 
     def _judge(self, job: NodeOrder, result: int, *, lost: bool) -> None:
-        """Continue after an ACK; ``lost``: an earlier reply may have been lost."""
+        """Continue after an ACK; ``lost`` means that an earlier reply may have been lost."""
         name = job.step.name
         if result == messages.DONE:
             self._epoch.taken(job.node.index)
@@ -426,7 +426,7 @@ class Orders:
         return text
 
     def _advance(self, job: NodeOrder, *, sure: bool = True) -> None:
-        """Continue after a step; not ``sure``: the goal shows whether it was accepted."""
+        """Continue after a step; if not ``sure``, the goal shows whether it was accepted."""
         if job.void:
             return self._fail(job, job.void)
         order, node, done = job.order, job.node, job.step
@@ -457,7 +457,10 @@ class Orders:
 
 
 async def stored(exchange: Exchange, node: ClusterNode, item: str, expires: float) -> bytes | None:
-    """Return a node's stored item, empty if it has none; None if it does not reply."""
+    """Return an item that a node stores.
+
+    The item is empty if the node stores none, and None if the node does not reply.
+    """
     answer = await exchange.ask(
         node,
         "QUERY_STORED",
@@ -473,12 +476,12 @@ async def stored(exchange: Exchange, node: ClusterNode, item: str, expires: floa
 
 
 def _typed(number: int, values: Sequence[float]) -> tuple[Any, ...]:
-    """Return numbers in the types of the wire's codes.
+    """Return numbers converted to the types that the bus protocol requires.
 
     Raises
     ------
     OrderRefusedError
-        Too many, too few, or a number that its code cannot hold.
+        If there are too many or too few numbers, or one is outside the range of its type.
     """
     name = messages.name_of(number)
     head = len(messages.HEADS[messages.who_of(number)][0])
@@ -499,7 +502,7 @@ def _typed(number: int, values: Sequence[float]) -> tuple[Any, ...]:
 
 
 def _steps_of_items(node: ClusterNode, message: Parameters) -> tuple[Step, ...]:
-    """Return the messages that store items, followed by their checks.
+    """Return the messages that store items, followed by the checks of these items.
 
     Raises
     ------

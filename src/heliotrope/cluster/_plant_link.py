@@ -1,4 +1,4 @@
-"""The cluster's end of the link to the plant: receives messages, sends reports and the status."""
+"""The cluster's end of the plant link: receives messages, sends reports and the status."""
 
 import contextlib
 from collections.abc import Callable
@@ -30,9 +30,9 @@ from heliotrope.links.messages import (
 )
 from heliotrope.safety import AcknowledgeRole, Alarm, alarms
 
-#: Life of a message to the plant, s. The ages in a status count from the time at which it was made.
-#: It is not sent later than `_STATUS_WAITS`, because the program may have been suspended in the
-#: meantime.
+#: Lifetime of a message to the plant, s. The ages in a status count from the time at which it was
+#: made. A status is not sent later than `_STATUS_WAITS`, because the program may have been
+#: suspended in the meantime.
 _NEWS_LIFE = 5.0
 _STATUS_LIFE, _STATUS_WAITS = 1.0, 1.0
 #: The names of the rows and the alarms are repeated after this many statuses, because a status may
@@ -48,11 +48,11 @@ class PlantLink:
     Parameters
     ----------
     config
-        Name of the cluster, the site for which it computes the sun, and its common settings.
+        Name of the cluster, the site for its sun vector, and its common settings.
     link, clock, nodes, watch, work, reports
         Parts of the cluster.
     wake
-        Called when a message has arrived, because it may be urgent.
+        Function that is called when a message has arrived, since the message may be urgent.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Polling: each heliostat reports its state once per second, in the order of addresses.
 
-Commands are sent in between. Replies are checked, faults and silence are reported, and the goals of
-commands are evaluated.
+Commands are sent between polls. Replies are checked, faults and silence are reported, and the goals
+of commands are evaluated.
 """
 
 import asyncio
@@ -52,7 +52,7 @@ class Polling:
 
     @property
     def silent(self) -> int:
-        """Number of silent heliostats."""
+        """Number of heliostats that do not reply."""
         return len(self._silent)
 
     def begin_second(self) -> None:
@@ -60,7 +60,7 @@ class Polling:
         self._number += 1
 
     async def round(self, until: float, work: Work, closing: asyncio.Event) -> None:
-        """Poll every node once, and carry out orders in between."""
+        """Poll every node once, and carry out orders between polls."""
         nodes, count = self._by_address, len(self._nodes)
         first, self._next = self._next, 0
         now = self._clock.monotonic()
@@ -76,11 +76,11 @@ class Polling:
                 now = self._clock.monotonic()
 
     async def look(self, node: ClusterNode) -> None:
-        """Poll the state of a node, between two rounds."""
+        """Poll the state of a node between two rounds."""
         await self._poll(node, self._clock.monotonic())
 
     async def _poll(self, node: ClusterNode, now: float) -> float:
-        """Poll a node for state and step counts at ``now``, and return the time afterwards."""
+        """Poll a node for its state and step counts at ``now``; return the time afterwards."""
         exchange, sequence = self._exchange, node.next_sequence()
         status = await exchange.poll(node, STATUS, sequence, now)
         if status is None or not self._believes(node, status, now):
@@ -97,7 +97,7 @@ class Polling:
         return exchange.now
 
     def _believes(self, node: ClusterNode, status: tuple[Any, ...], asked_at: float) -> bool:
-        """Accept a STATUS; return False if its firmware has states that are unknown here."""
+        """Accept a STATUS; return False if it contains a state that is unknown here."""
         if status[0] >= len(states.STATES):
             self._reports.alarm(alarms.NODE_UNINTELLIGIBLE.raised(node.name, state=status[0]))
             self._unreadable.add(node.index)
@@ -129,7 +129,7 @@ class Polling:
             self._reports.clear(alarms.NODE_FAULT.ended(node.name))
 
     def _report_sun(self, node: ClusterNode) -> None:
-        """Report the first jump of the sun since a local controller started."""
+        """Report the first jump of the sun vector since a local controller started."""
         if node.flags & names.SUN_JUMPED:
             self._jumped[node.name] = node.heard_at
             self._reports.alarm(alarms.SUN_JUMPED.raised(node.name))

@@ -1,4 +1,4 @@
-"""Queries from the plant: checksums, stored items, diagnoses, statistics, discovery, frames."""
+"""Plant queries: checksums, stored items, diagnoses, statistics, discovery, frames."""
 
 from collections import deque
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from heliotrope.cluster._reports import Reports
 from heliotrope.lcu.journal import ITEMS
 from heliotrope.links.messages import Answer, Ask
 
-#: Items that are never revealed.
+#: Items whose contents are never sent to the plant.
 _SECRET = ("key_id", "bus_keys")
 _PATIENCE = 5.0
 #: Attempts for a node that does not reply, one per second.
@@ -32,7 +32,7 @@ class _Recall:
 
     @property
     def item(self) -> str:
-        """The next item."""
+        """The next item to be requested."""
         return _STORED[len(self.items)]
 
 
@@ -60,7 +60,7 @@ class Questions:
         return bool(self._waiting)
 
     def take(self, ask: Ask) -> None:
-        """Answer a query, or keep it until the bus is free."""
+        """Answer a query, or hold it until the bus is free."""
         if ask.what == "checksums":
             data = {node.name: node.status[7] for node in self._nodes if node.known}
             self._reports.answer(Answer(ask.identity, data))
@@ -86,7 +86,7 @@ class Questions:
         }
 
     def second(self) -> None:
-        """Make queries to be retried ready again, and send a recording that is complete."""
+        """Make ready the queries that are to be retried, and send a complete recording."""
         self._waiting.extend(self._later)
         self._later.clear()
         if self._bus.complete:
@@ -103,7 +103,7 @@ class Questions:
             self._bus.record()
 
     async def serve(self) -> None:
-        """Do one step of the first query."""
+        """Carry out one step of the first query."""
         first = self._waiting[0]
         if isinstance(first, _Recall):
             self._waiting.popleft()

@@ -1,4 +1,4 @@
-"""Reports to the plant: command stages, alarms, replies and the status; bounded, in order."""
+"""Reports to the plant: command stages, alarms, replies and the status."""
 
 import asyncio
 from collections import deque
@@ -12,7 +12,7 @@ _CAPACITY = 256
 
 
 class Reports:
-    """An outbox.
+    """A bounded outbox of reports, which are sent in order.
 
     The same stage of one command at several heliostats becomes one message. An alarm is reported
     when it changes, and again at intervals while it is active. A status with names lists the active
@@ -27,7 +27,7 @@ class Reports:
         self._published = asyncio.Event()
 
     def add(self, identity: str, stage: Stage, heliostat: str = "", text: str = "") -> None:
-        """Report a stage of a command; a command without identity is the cluster's own."""
+        """Report a stage of a command; a command without identity is the cluster's own command."""
         if identity:
             self._groups.setdefault((identity, stage, text), []).append(heliostat)
 
@@ -36,7 +36,7 @@ class Reports:
         self._out.append(answer)
 
     def status(self, status: ClusterStatus) -> None:
-        """Report the status, in place of the previous one."""
+        """Report the status, which replaces a waiting status."""
         self._status = status
 
     def alarm(self, alarm: Alarm) -> None:
@@ -48,7 +48,7 @@ class Reports:
             self._out.append(alarm)
 
     def event(self, alarm: Alarm) -> None:
-        """Report an event without duration, each time it happens."""
+        """Report an event without duration each time that it happens."""
         self._out.append(alarm)
 
     def clear(self, ended: Alarm) -> None:
@@ -63,7 +63,7 @@ class Reports:
         return tuple(self._alarms.values())
 
     def repeat(self) -> None:
-        """Report all active alarms: to a new connection, and because any may have been lost."""
+        """Report all active alarms to a new connection, and also because any report may be lost."""
         waiting = {id(message) for message in self._out}
         self._out.extend(alarm for alarm in self._alarms.values() if id(alarm) not in waiting)
 
@@ -75,12 +75,12 @@ class Reports:
             self._published.set()
 
     async def published(self) -> None:
-        """Wait for `publish`."""
+        """Wait until `publish` is called with reports."""
         await self._published.wait()
         self._published.clear()
 
     def take(self) -> list[Message]:
-        """Return all waiting reports, and clear the outbox."""
+        """Return all waiting reports and clear the outbox."""
         messages = list(self._out)
         self._out.clear()
         for (identity, stage, text), names in self._groups.items():
@@ -92,7 +92,7 @@ class Reports:
         return messages
 
     def _listing(self, status: ClusterStatus) -> ClusterStatus:
-        """Return a status with the alarms that are active now, if it has names."""
+        """Return a status; if it contains names, the currently active alarms are added."""
         if not status.names:
             return status
         listed = tuple(f"{condition} {subject}" for condition, subject in self._alarms)

@@ -1,4 +1,4 @@
-"""Monitoring in a cluster: its rows of the safety table, and the plant's lease."""
+"""Monitoring in a cluster: the cluster's rows of the safety table, and the plant's lease."""
 
 import math
 from collections.abc import Callable
@@ -39,18 +39,18 @@ _UNBOUNDED = 1e9  # beyond safety.condition.UNKNOWN_TIME
 
 @dataclass(frozen=True)
 class Verdict:
-    """Demands of the safety table.
+    """The actions that the safety table requires.
 
     Attributes
     ----------
     act
-        The strongest act; None: nothing is wrong.
+        The strongest required action; None if nothing is wrong.
     new
-        DEFOCUS or STOW if it has just been demanded; None otherwise.
+        DEFOCUS or STOW if the table has just begun to require it; None otherwise.
     acts
-        All acts, for the status: "DEFOCUS plant_link_lost".
+        All required actions, for the status, such as "DEFOCUS plant_link_lost".
     forbidden
-        Why motion is forbidden, empty if it is allowed.
+        Reason why motion is forbidden; empty if motion is allowed.
     """
 
     act: Act | None = None
@@ -65,7 +65,7 @@ class Verdict:
 
 
 class Watch:
-    """The safety table of a cluster, fed once a second, and the plant's lease.
+    """The safety table of a cluster, evaluated once a second, and the plant's lease.
 
     Parameters
     ----------
@@ -76,18 +76,19 @@ class Watch:
     reports
         Receives alarms.
     now, present
-        Monotonic time, s, and the time with which that of the next second is compared.
+        Monotonic time, s, and the reported time at that moment, with which the next second's time
+        is compared.
     limits
         Limits of the safety table that the plant sets.
     line
-        Function that returns whether current flows in the emergency line; None: there is no line.
+        Function that returns whether current flows in the emergency line; None if there is no line.
 
     Attributes
     ----------
     token
-        Token of the command authority in the last lease; 0: none.
+        Token of the command authority in the last lease; 0 if there is none.
     verdict
-        Demands of the safety table in this second.
+        Actions that the safety table requires in this second.
     runs
         Run of the plant that the cluster belongs to, and the runs that it refuses.
     """
@@ -121,7 +122,7 @@ class Watch:
     # -- the lease -------------------------------------------------------------------------
 
     def take(self, lease: Lease, now: float) -> str | None:
-        """Accept a new lease; return the reason if it is refused."""
+        """Accept a new lease, or return the reason for its refusal."""
         if not _SHORTEST_LEASE <= lease.lifetime <= _PLANT_LEASE:
             return (
                 f"the lease must last {_SHORTEST_LEASE:g} to {_PLANT_LEASE:g} s, not "
@@ -148,21 +149,21 @@ class Watch:
         return None
 
     def lease_left(self, now: float) -> float:
-        """Return the remaining time of the plant's lease without autonomy, s; below 0: expired."""
+        """Return the plant's remaining lease without autonomy, s; below 0 once it has expired."""
         return max(self._over - now, -_UNBOUNDED)
 
     def alone(self, now: float) -> bool:
-        """Whether lease and autonomy have expired."""
+        """Return whether both the lease and the autonomy have expired."""
         return now >= self._over + self._autonomy
 
     def authority(self, now: float) -> int:
-        """Return the token of the command authority, 0 once lease and autonomy have expired."""
+        """Return the token of the command authority; 0 once lease and autonomy have expired."""
         return 0 if self.alone(now) else self.token
 
     # -- the table -------------------------------------------------------------------------
 
     def second(self, time: Time, bus_errors: float, now: float) -> Verdict:
-        """Feed the table, and return its verdict."""
+        """Evaluate the table for this second, and return its verdict."""
         readings = {
             ("bus_errors", ""): Reading(bus_errors, now),
             ("clock_step", ""): Reading(self._step(time, now), now),
@@ -204,9 +205,9 @@ class Watch:
         return self.verdict
 
     def _step(self, time: Time, now: float) -> float:
-        """Return the step of the time relative to the monotonic clock, s.
+        """Return by how much the time has stepped relative to the monotonic clock, s.
 
-        The last time that had a source counts, however long ago that was.
+        The comparison is with the last time that had a source, however old.
         """
         if time.quality == "none":
             return 0.0
@@ -226,6 +227,6 @@ class Watch:
             )
 
     def acknowledge(self, condition: str, who: str, role: AcknowledgeRole) -> str | None:
-        """Acknowledge a latching row; return the reason for a refusal, None if accepted."""
+        """Acknowledge a latching row; return the reason for a refusal, or None if accepted."""
         self._state, refusal = acknowledge(self._state, condition, who, role)
         return refusal

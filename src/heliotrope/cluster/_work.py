@@ -1,4 +1,4 @@
-"""Work for the bus: emergencies first, then commands and parameters, then queries."""
+"""Work on the bus: emergencies first, then commands and parameters, then queries."""
 
 from heliotrope.cluster._emergencies import Emergencies
 from heliotrope.cluster._epoch import Epoch
@@ -12,7 +12,7 @@ from heliotrope.links.messages import Ask, Command, Emergency, Parameters, Stage
 
 
 class Work:
-    """Accepts orders, and carries them out step by step, the most urgent first."""
+    """Accepts orders and carries them out step by step, the most urgent first."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class Work:
             self._take_named(message)
 
     def _take_named(self, message: Emergency | Command) -> None:
-        """Accept an order for the heliostats of this cluster; the others are named in a refusal."""
+        """Accept an order for this cluster's heliostats, and refuse it for all other names."""
         nodes, unknown = self._nodes.chosen(message.heliostats)
         for name, refusal in unknown.items():
             self._reports.add(message.identity, Stage.REFUSED, name, refusal)
@@ -60,18 +60,18 @@ class Work:
         self._exchange.interrupt()
 
     def obey(self, name: str, why: str) -> None:
-        """Obey the safety table: DEFOCUS or STOW for all; earlier orders are void."""
+        """Carry out a DEFOCUS or STOW that the safety table requires; earlier orders are void."""
         self._orders.cancel(self._nodes, name, f"overruled: {why}")
         self._emergencies.begin("", name, list(self._nodes))
 
     def ready(self, *, patient: bool = True) -> bool:
-        """Whether there is work to do; queries count only if ``patient``."""
+        """Return whether there is work to do; queries count only if ``patient``."""
         return self._exchange.connected and (
             self._emergencies.pressing or self._orders.ready or (patient and self._questions.ready)
         )
 
     async def serve(self) -> None:
-        """Do one piece of work."""
+        """Carry out one step of the most urgent work."""
         if self._emergencies.pressing:
             await self._emergencies.serve()
         elif self._orders.ready:
@@ -81,7 +81,7 @@ class Work:
         self._reports.publish()
 
     async def begin_second(self) -> None:
-        """Request missing acknowledgements again, those of emergencies at once."""
+        """Resume work in a new second: request missing acknowledgements, emergencies first."""
         self._questions.second()
         self._epoch.second()
         self._emergencies.second()
@@ -89,5 +89,5 @@ class Work:
             await self._emergencies.serve()
 
     def resume(self) -> None:
-        """Make orders that are to be retried ready again."""
+        """Make ready the orders that are to be retried."""
         self._orders.second()

@@ -1,4 +1,4 @@
-"""Configuration of a cluster controller: site, heliostats, limits; read by `config_file`."""
+"""Configuration of a cluster controller: site, heliostats and limits, read by `config_file`."""
 
 import math
 from dataclasses import dataclass, field
@@ -24,9 +24,10 @@ class Member:
     address
         Bus address, 1 to 65534.
     serial
-        Serial number of its local controller, for discovery and address assignment; None: unknown.
+        Serial number of its local controller, for discovery and address assignment; None if
+        unknown.
     key
-        Key of its local controller, needed to store items; b"": nothing can be stored.
+        Key of its local controller, needed to store items; with b"", nothing can be stored.
 
     Raises
     ------
@@ -54,7 +55,7 @@ class Member:
 
 @dataclass(frozen=True)
 class ClusterConfig:
-    """A cluster.
+    """Configuration of a cluster.
 
     Parameters
     ----------
@@ -63,11 +64,12 @@ class ClusterConfig:
     site
         Location and atmosphere, for the sun vector.
     heliostats
-        1 to 32 heliostats; polled in the order of their addresses, reported in this order.
+        1 to 32 heliostats. They are polled in the order of their addresses, and reported in the
+        order given here.
     answer
         Timeout from the end of a query to the complete reply, in s.
     stored_answer
-        The same if flash is written before the reply, in s.
+        Timeout if flash is written before the reply, in s.
     steps_every
         Interval at which the step counts of each heliostat are requested, in s.
     silence
@@ -137,7 +139,7 @@ class ClusterConfig:
         Raises
         ------
         UnknownNameError
-            If this cluster has no heliostat of that name.
+            If this cluster has no heliostat with that name.
         """
         for member in self.heliostats:
             if member.name == name:
@@ -146,7 +148,7 @@ class ClusterConfig:
 
 
 def spread_phase(index: int, count: int) -> float:
-    """Return the phase of one of many clusters in a process, so that their seconds do not collide.
+    """Return the phase of one of many clusters in a process, so that the work is spread.
 
     Parameters
     ----------
@@ -158,7 +160,7 @@ def spread_phase(index: int, count: int) -> float:
     Returns
     -------
     float
-        In s, 0 to below 1; consecutive clusters are as far apart as possible.
+        Phase in s, 0 to below 1; consecutive clusters are as far apart as possible.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The cluster file (TOML) with which a cluster controller starts; its keys are in another file."""
+"""The cluster file (TOML) with which a cluster controller starts; another file has its keys."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -101,7 +101,7 @@ class TimeTable(Table):
 
 
 class PollingTable(Table):
-    """``[polling]``."""
+    """``[polling]``: times for polling the heliostats."""
 
     steps_every_s: int = Field(
         CommonSettings.steps_every,
@@ -121,7 +121,7 @@ class PollingTable(Table):
 
 
 class SafetyTable(Table):
-    """``[safety]``."""
+    """``[safety]``: limits of the safety table."""
 
     longest_autonomy_s: float = Field(
         0.0,
@@ -142,7 +142,7 @@ class SafetyTable(Table):
 
     @property
     def limits(self) -> Limits:
-        """The limits by condition."""
+        """The limits, by condition."""
         apart = ("emergency_line", "longest_autonomy_s")
         return self.model_dump(exclude_defaults=True, exclude=set(apart))
 
@@ -158,7 +158,7 @@ class MemberTable(Table):
 
 
 class ClusterDocument(Table):
-    """The whole file."""
+    """The whole cluster file."""
 
     format: Literal["heliotrope-cluster"]
     version: Literal[1]
@@ -197,23 +197,25 @@ class Installation:
     bus_url, bus
         URL and settings of the serial port.
     plant
-        ``[plant]``.
+        The table ``[plant]``.
     scheme, host, port, prefix
-        Parts of the plant's URL; ``prefix`` of MQTT topics.
+        Parts of the plant's URL; ``prefix`` is the prefix of MQTT topics.
     key_file
-        Key file; None: there is none.
+        Key file; None if there is none.
     bus_key_file, bus_keys
-        File of the bus keys, and the keys, replaced by `take_bus_keys`; None: no frame is signed.
+        File of the bus keys, and the keys, which `take_bus_keys` replaces; None if no frame is
+        signed.
     plant_keys, password
-        Keys of the link, and password for the MQTT broker; replaced by `take_keys`.
+        Keys of the link and password for the MQTT broker, which `take_keys` replaces.
     error
-        Bound on the clock error that the operator guarantees, s; None: the kernel's bound is used.
+        Bound on the clock error that the operator guarantees, s; None if the kernel's bound is
+        used.
     gpsd
-        Host and port of gpsd; None: there is none.
+        Host and port of gpsd; None if there is none.
     state
-        File for epoch and editions.
+        File that stores epoch and editions.
     emergency_line
-        GPIO file of the emergency line; None: there is no line.
+        GPIO file of the emergency line; None if there is no line.
     """
 
     config: ClusterConfig
@@ -235,12 +237,12 @@ class Installation:
     emergency_line: Path | None
 
     def take_keys(self) -> None:
-        """Read the key file again, and update the keys of the link; heliostat keys stay unchanged.
+        """Read the key file again and update the link's keys; heliostat keys stay unchanged.
 
         Raises
         ------
         FormatError
-            If the file cannot be used, or no longer has the plant key.
+            If the file cannot be used, or no longer contains the plant key.
         """
         keys = Keys(self.key_file, HELIOSTATS)
         if not keys.plant:
@@ -265,7 +267,7 @@ def read_cluster(path: str | Path) -> Installation:
     Raises
     ------
     FormatError
-        If something cannot be used; the text names file, place, value and limit.
+        If an entry cannot be used; the text names the file, the entry, its value and the limit.
     """
     path = Path(path)
     _refuse_old(path)
@@ -281,7 +283,7 @@ def read_cluster(path: str | Path) -> Installation:
 
 
 def _refuse_old(path: Path) -> None:
-    """Refuse keys of an earlier format, and say what to write instead."""
+    """Refuse keys of an earlier file format, and say what to write instead."""
     time = read_toml(path, "a cluster file").get("time")
     for key in time if isinstance(time, dict) else ():
         if key in _OLD_TIME:
@@ -344,7 +346,7 @@ def _install(
 
 
 def _placed(path: Path, table: PlantLinkTable) -> PlantLinkTable:
-    """Return a table with file paths relative to the folder of the cluster file."""
+    """Return a table whose file paths are relative to the folder of the cluster file."""
     if table.authority is None:
         return table
     return table.model_copy(update={"authority": str(path.parent / table.authority)})

@@ -1,10 +1,10 @@
 """The cluster controller: master of one bus with up to 32 heliostats.
 
-Every second it broadcasts session, time and sun vector (`_broadcast`), polls each local controller
-in the order of addresses (`_polling`), in between carries out the plant's orders (`_work`:
-`_emergencies`, then `_orders`, then `_questions`), and reports to the plant (`_plant_link`). Only
-one task uses the bus, so frames are sent in the order of their numbers; a second task receives from
-the plant; a third sends to the plant and may wait for it.
+Every second the controller broadcasts session, time and sun vector (`_broadcast`), polls each local
+controller in the order of addresses (`_polling`), carries out the plant's orders between polls
+(`_work`: `_emergencies`, then `_orders`, then `_questions`), and reports to the plant
+(`_plant_link`). Only one task uses the bus, so frames are sent in the order of their numbers; a
+second task receives from the plant; a third sends to the plant and may wait for it.
 
 The field is safe when left alone: the sun vector is sent only while the plant's lease (and the
 autonomy that it grants) is valid, the time is reliable, and no row of the safety table requires
@@ -69,17 +69,17 @@ class Cluster:
     time
         Source of GPS time and UTC; the owner runs it.
     kept
-        Epoch and editions; None: nothing survives this object.
+        Epoch and editions; if None, nothing survives this object.
     line
-        Function that returns whether current flows in the hard-wired emergency line; None: there is
-        no line.
+        Function that returns whether current flows in the hard-wired emergency line; None if there
+        is no line.
     bus_keys
-        Keys that sign the frames on the bus; None: frames are not signed.
+        Keys that sign the frames on the bus; None if frames are not signed.
 
     Attributes
     ----------
     nodes
-        Its local controllers, in the order of the configuration.
+        The local controllers, in the order of the configuration.
     cycle
         Duration of the last second's work, s.
     """
@@ -155,7 +155,7 @@ class Cluster:
 
     @property
     def lease_left(self) -> float:
-        """Remaining time of the plant's lease, s; below 0: no plant controls the cluster."""
+        """Remaining time of the plant's lease, s; below 0 if no plant controls the cluster."""
         return self._watch.lease_left(self._clock.monotonic())
 
     async def run(self) -> None:
@@ -164,7 +164,7 @@ class Cluster:
         Raises
         ------
         LinkError
-            If it is already running.
+            If the controller is already running.
         """
         if self._running:
             raise LinkError(f"cluster {self.config.name}: it is already running")
@@ -184,14 +184,14 @@ class Cluster:
             self._ended.set()
 
     async def close(self) -> None:
-        """Defocus, and stop ``run``; returns when that is done."""
+        """Defocus and stop ``run``; return when that is done."""
         self._closing.set()
         self._wake.set()
         if self._running:
             await self._ended.wait()
 
     async def _master(self) -> None:
-        """Run one second after the other; this is the only task that uses the bus."""
+        """Run one second after another; this is the only task that uses the bus."""
         due = self._clock.monotonic()
         present = self._time.time()
         if present.usable:
@@ -218,7 +218,7 @@ class Cluster:
                 alarm.cancel()
 
     async def _second(self) -> float:
-        """Run the tasks of one second, and return when the next one begins."""
+        """Carry out the tasks of one second and return when the next second begins."""
         begin = self._clock.monotonic()
         present = self._time.time()
         self._polling.begin_second()
@@ -245,11 +245,11 @@ class Cluster:
         return begin + 1.0 - max(-_STEER, min(_STEER, ahead))
 
     def take_alarm(self, alarm: Alarm) -> None:
-        """Report an alarm of the enclosing program, raised or cleared."""
+        """Report an alarm that the enclosing program has raised or cleared."""
         (self._reports.alarm if alarm.active else self._reports.clear)(alarm)
 
     def line(self) -> str:
-        """Return the state in one line, for a log."""
+        """Return the controller's state in one line, for a log."""
         counts = [0] * len(states.STATES)
         for node in self.nodes:
             if node.known:

@@ -1,8 +1,8 @@
-"""Cluster state that survives a restart: its epoch, and the editions it has used.
+"""Cluster state that survives a restart: its epoch, and the editions that it has used.
 
-Both only increase. The file is written beside the old one and renamed, so that a power failure
-leaves either the old file or the new one. Editions are reserved in blocks, before they are needed,
-so that the edition on disk is never below one that was used.
+Both numbers only increase. A new file is written beside the old one and renamed, so that a power
+failure leaves either the old file or the new one. Editions are reserved in blocks, before they are
+needed, so that the edition on disk is never below one that was used.
 
 Only two things wait for the disk, because they must not be used before they are stored: a new
 epoch, and an edition beyond those reserved.
@@ -29,11 +29,11 @@ class Kept:
     Parameters
     ----------
     path
-        Path of the file; None: nothing is stored, for simulation.
+        Path of the file; if None, nothing is stored, as in simulation.
     epoch, edition
-        Last values used, if there is no file.
+        Last used values, if there is no file.
     disk
-        Disk that writes the file once the cluster runs; None: written at once.
+        Disk that writes the file once the cluster runs; if None, the file is written at once.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Kept:
     Raises
     ------
     FormatError
-        If the file has other content.
+        If the file does not contain this state.
     """
 
     def __init__(
@@ -60,9 +60,9 @@ class Kept:
         self._problem: Exception | None = None
 
     def start(self, at_least: int) -> int:
-        """Return the epoch of a new run, above all earlier ones and not below ``at_least``.
+        """Return the epoch of a new run, above all earlier epochs and at least ``at_least``.
 
-        It waits for the disk, and reserves editions in the same write operation.
+        The method waits for the disk, and reserves editions in the same write operation.
 
         Raises
         ------
@@ -75,7 +75,10 @@ class Kept:
         return epoch
 
     def begin(self, at_least: int, then: Callable[[int, Exception | None], None]) -> None:
-        """Store an epoch as in `start`; when done, call ``then`` with it and None, or an error."""
+        """Store an epoch as in `start`.
+
+        When this is done, ``then`` is called with the epoch and None, or with an error.
+        """
         epoch = self._above(at_least)
 
         def stored(error: Exception | None) -> None:
@@ -86,12 +89,12 @@ class Kept:
         self._disk.do(partial(self._write, epoch, 0), stored)
 
     def next_edition(self, above: int = 0) -> int | None:
-        """Return a never-used edition above a given one; None: it is being stored.
+        """Return an unused edition above a given edition; None while it is being stored.
 
         Raises
         ------
         OSError
-            If it could not be stored; the edition is then not used either, and storing is retried.
+            If the edition could not be stored; it is then not used, and storing is retried.
         """
         edition = max(self._edition, above) + 1
         if edition + _AHEAD > self._reserved and not self._reserving:
@@ -121,7 +124,10 @@ class Kept:
         self._disk.do(partial(self._write, 0, reserved), stored)
 
     def _write(self, epoch: int, reserved: int) -> None:
-        """Write both numbers, neither below what was written before; one write at a time."""
+        """Write both numbers, neither below its last written value.
+
+        Only one write runs at a time.
+        """
         epoch, reserved = max(epoch, self._handed[0]), max(reserved, self._handed[1])
         if self._path is not None:
             beside = self._path.with_name(self._path.name + ".new")

@@ -1,4 +1,4 @@
-"""A cluster built from its cluster file: time sources, emergency line, and run in a process.
+"""A cluster built from its cluster file: its time sources and emergency line, and its process.
 
 `heliotrope cluster` runs a cluster in its own process. If the bus is attached to the plant's
 computer, the plant runs the same program with an in-memory link instead of a network
@@ -39,9 +39,10 @@ def time_of(installation: Installation, clock: Clock) -> TimeKeeper:
 
 
 def line_of(file: Path | None) -> Callable[[], bool] | None:
-    """Return a function that reads the emergency line from a GPIO file; None: there is no line.
+    """Return a function that reads the emergency line; None if there is no line.
 
-    The function returns whether current flows. A file that cannot be read counts as an open line.
+    The function reads a GPIO file and returns whether current flows. A file that cannot be read
+    counts as an open line.
     """
     if file is None:
         return None
@@ -62,9 +63,9 @@ class LocalCluster:
     Parameters
     ----------
     path
-        Path of its cluster file; the table ``[plant]`` is not used.
+        Path of the cluster file, whose table ``[plant]`` is not used.
     name, members
-        Name of the cluster and of its heliostats in the plant.
+        Names of the cluster and of its heliostats in the plant.
     clock
         Clock of the plant.
 
@@ -77,12 +78,12 @@ class LocalCluster:
     cluster
         The cluster; the owner runs it within ``parts``.
     installation
-        As read from the cluster file.
+        The installation as read from the cluster file.
 
     Raises
     ------
     FormatError
-        If the file is for another cluster, or its heliostats are not those of the plant.
+        If the file is for another cluster, or lists other heliostats than the plant does.
     """
 
     def __init__(self, path: Path, name: str, members: tuple[str, ...], clock: Clock) -> None:

@@ -1,9 +1,9 @@
 """The bus of a cluster: RS485 through serialx, with this side as its only master.
 
-One transaction at a time: wait until the bus has been quiet for a gap, send, read the reply. The
-caller's codec decides what a reply is (`complete`); in this module a reply is bytes. Urgent frames
-(defocus, stow) are sent next, before all waiting frames. A frame whose turn comes after its expiry
-is dropped.
+The bus runs one transaction at a time: it waits until the line has been quiet for a gap, sends, and
+reads the reply. The caller's codec decides what a complete reply is (`complete`); in this module a
+reply is just bytes. Urgent frames (defocus, stow) are sent next, before all waiting frames. A frame
+whose turn comes after its expiry is dropped.
 
 The adapter switches its driver automatically. Some adapters receive their own frames: with ``echo``
 the frame is removed from the received bytes, and an altered echo (two senders at once) invalidates
@@ -47,7 +47,7 @@ class BusSettings:
     baud_rate
         Bits per second; a character has ten.
     gap
-        Silence before a frame, in s; None: 3.5 characters, at least 1.75 ms, as on Modbus.
+        Silence before a frame, in s; None for 3.5 characters, at least 1.75 ms, as on Modbus.
     echo
         Whether the adapter receives its own frames.
     first_pause, longest_pause
@@ -81,31 +81,32 @@ class BusSettings:
             )
 
     def duration(self, size: int) -> float:
-        """Return how long ``size`` bytes take on the wire, in s."""
+        """Return how long ``size`` bytes take on the line, in s."""
         return size * _BITS / self.baud_rate
 
     @property
     def quiet(self) -> float:
-        """The gap in s."""
+        """The gap before a frame, s."""
         return max(self.duration(1) * 3.5, 0.00175) if self.gap is None else self.gap
 
 
 @dataclass(slots=True)
 class BusStatistics:
-    """Counts of a bus since it was created.
+    """Counts of a bus since its creation.
 
     Attributes
     ----------
     sent, answered, silent
-        Frames sent; requests with reply bytes; requests without.
+        Frames sent; requests that received reply bytes; requests that received none.
     dropped, expired
-        Frames not sent because there was no port; because they had expired before their turn.
+        Frames not sent because there was no port; frames not sent because they had expired before
+        their turn.
     stray
         Unrequested bytes.
     spoilt
         Frames whose echo was altered or missing.
     opened, failures, reconnects
-        Ports opened; failed attempts; ports opened after the first.
+        Ports opened; failed attempts; ports opened after the first port.
     last_received
         When the last byte arrived, in s of the monotonic clock.
     """
@@ -124,12 +125,12 @@ class BusStatistics:
 
 
 def ends_in_zero(data: bytes) -> bool:
-    """Return whether bytes hold a complete frame: at least one other byte, then a zero."""
+    """Return whether bytes contain a complete frame: at least one other byte, then a zero."""
     return data.endswith(b"\0") and bool(data.strip(b"\0"))
 
 
 class _Port(asyncio.Protocol):
-    """Received bytes of a port and their times, without the adapter's own echo."""
+    """The bytes received from a port with their times, without the adapter's own echo."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -154,13 +155,13 @@ class _Port(asyncio.Protocol):
         self.news.set()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Note that the port is gone."""
+        """Record that the port is gone."""
         self.problem = str(exc) if exc else "the port closed"
         self.lost.set()
         self.news.set()
 
     async def hear(self, until: float) -> None:
-        """Wait for the next bytes, or until a monotonic time."""
+        """Wait for the next bytes, but no longer than until a monotonic time."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(until - self._clock.monotonic()):
                 await self.news.wait()
@@ -175,7 +176,7 @@ class SerialBus:
     url
         URL of the port; see the docstring of this module.
     clock
-        Its monotonic time measures gaps and expiries.
+        Clock whose monotonic time measures gaps and expiries.
     settings
         See `BusSettings`.
 
@@ -184,7 +185,7 @@ class SerialBus:
     statistics
         See `BusStatistics`.
     problem
-        Why the port is not open, empty if it is.
+        Reason why the port is not open; empty if it is open.
     """
 
     def __init__(self, url: str, clock: Clock, settings: BusSettings | None = None) -> None:
@@ -208,7 +209,7 @@ class SerialBus:
 
     @property
     def closed(self) -> bool:
-        """Whether the bus is closed for good."""
+        """Whether the bus is closed permanently."""
         return self._closing.is_set()
 
     async def opened(self) -> None:
@@ -220,7 +221,7 @@ class SerialBus:
             await self._opened.wait()
 
     async def close(self) -> None:
-        """Close the bus for good."""
+        """Close the bus permanently."""
         self._closing.set()
         self._opened.set()
 
@@ -232,7 +233,7 @@ class SerialBus:
         Raises
         ------
         LinkError
-            If it is already running.
+            If the bus is already running.
         """
         if self._running:
             raise LinkError(f"bus {self._url}: it is already running")
@@ -277,7 +278,7 @@ class SerialBus:
             self._port = self._transport = None
             port.lost.set()
             port.news.set()
-            transport.abort()  # whatever has not been sent yet must not be sent later
+            transport.abort()  # data not yet sent must not be sent later
             await transport.wait_closed()
 
     # -- transactions ------------------------------------------------------------------
@@ -285,7 +286,7 @@ class SerialBus:
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
     ) -> SendOutcome:
-        """Send a frame that gets no reply, and wait until it has been sent.
+        """Send a frame that expects no reply, and wait until it has been sent.
 
         Parameters
         ----------
@@ -294,7 +295,7 @@ class SerialBus:
         expires
             Monotonic time after which the frame is dropped.
         urgent
-            Send it next, before all waiting frames.
+            Whether the frame is sent next, before all waiting frames.
 
         Raises
         ------
@@ -331,14 +332,14 @@ class SerialBus:
         expires, urgent
             As in `transmit`.
         complete
-            Function that returns whether the bytes received so far are the complete reply; None:
-            `ends_in_zero`, the rule of the wire.
+            Function that returns whether the bytes received so far are the complete reply; None for
+            `ends_in_zero`, the rule of the bus protocol.
 
         Returns
         -------
         bytes
-            Whatever was received, complete or not; empty if nothing was received or the frame was
-            not sent (see ``statistics``). Only the codec can decide whether it is a reply.
+            All bytes received, complete or not; empty if nothing was received or the frame was not
+            sent (see ``statistics``). Only the codec can decide whether they are a reply.
 
         Raises
         ------
@@ -399,7 +400,7 @@ class SerialBus:
         return False
 
     async def _hear(self, port: _Port, end: float, complete: Callable[[bytes], bool]) -> bytes:
-        """Return the bytes received until they are complete, or until ``end``."""
+        """Return the bytes received until they are complete, or until the time ``end``."""
         while True:
             answer = bytes(port.data)
             over = port.lost.is_set() or port.spoilt or self._clock.monotonic() >= end

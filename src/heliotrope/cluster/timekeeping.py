@@ -1,12 +1,12 @@
-"""The time of a cluster, with a bound on its error and its source.
+"""The time of a cluster, with a bound on its error and with its source.
 
-The sun moves 73 µrad per second, and a heliostat that tracks with a wrong time is off by as much. A
-cluster therefore always uses a `Time`, which is an interval (`Time.error`).
+The sun moves 73 µrad per second, and a heliostat that tracks with a wrong time is off by just as
+much. A cluster therefore always uses a `Time`, which is an interval (`Time.error`).
 
 The computer's clock is disciplined by chrony (or another NTP program), from a satellite receiver
-with a pulse output, from time servers, or from both. The kernel maintains the bound on the clock
-error: chrony renews it, and between renewals it grows by 0.5 ms per second. `SystemTime` uses that
-bound.
+with a pulse output, from time servers, or from both. The kernel maintains a bound on the clock
+error, which chrony renews, and which grows by 0.5 ms per second between renewals. `SystemTime` uses
+that bound.
 
 A `Time` is for information only. Leases, deadlines and expiries rest on `Clock.monotonic` alone, so
 a jump, forward or back, extends nothing; `Steadiness` detects a jump by comparison with the
@@ -27,7 +27,7 @@ from heliotrope.links.gpsd import Gpsd
 
 Quality = Literal["gps", "system", "holdover", "none"]
 
-#: An earlier time is not believed, because a computer without a clock battery starts in the past.
+#: A time before this is not believed, since a computer without a clock battery starts in the past.
 NOT_BEFORE = datetime(2026, 1, 1, tzinfo=UTC)
 #: adjtimex(2) returns this for a clock that is not synchronised.
 _TIME_ERROR = 5
@@ -58,15 +58,16 @@ class Time:
     gps_s
         Seconds of the GPS time scale since 6 January 1980, which has no leap seconds.
     error
-        Bound on the error of both, s; infinite: unknown.
+        Bound on the error of both times, s; infinite if unknown.
     quality
         "gps": a disciplined clock, confirmed by a receiver with a fix; "system": a disciplined
-        clock; "holdover": not disciplined for some time, so its bound grows; "none": unusable.
+        clock; "holdover": a clock that has not been disciplined for some time, so that its bound
+        grows; "none": unusable.
     jumped
-        Whether the clock was set, forward or back, within the last seconds, so that intervals
-        between times before and after are meaningless.
+        Whether the clock was set, forward or back, within the last seconds; intervals across the
+        jump are then meaningless.
     note
-        What is wrong, in one line for the operator; empty if nothing is wrong.
+        Description of the problem in one line, for the operator; empty if there is none.
     """
 
     utc_s: float
@@ -78,7 +79,7 @@ class Time:
 
     @property
     def usable(self) -> bool:
-        """Whether it may be sent, that is, it is known within 1 s."""
+        """Whether the time may be sent, that is, whether it is known within 1 s."""
         return self.quality != "none" and self.error < LARGEST_ERROR
 
 
@@ -90,7 +91,7 @@ class TimeKeeper(Protocol):
     """
 
     def time(self) -> Time:
-        """Return the time now."""
+        """Return the current time."""
         ...
 
     async def run(self) -> None:
@@ -98,26 +99,27 @@ class TimeKeeper(Protocol):
         ...
 
     async def close(self) -> None:
-        """End ``run``."""
+        """Make ``run`` return."""
         ...
 
 
 class Steadiness:
-    """Detects that a clock was set, by comparing it with the monotonic clock.
+    """Detects that a clock was set by comparing it with the monotonic clock.
 
     Parameters
     ----------
     clock
-        Its monotonic time is the reference.
+        Clock whose monotonic time is the reference.
     tolerance
-        A step up to this is not a jump, s. Slewing (up to 1 ms in a second) never is.
+        A step up to this size is not a jump, s. Slewing (up to 1 ms in a second) never counts as a
+        jump.
     settle
-        How long a jump is reported, s.
+        Time for which a jump is reported, s.
 
     Raises
     ------
     InputError
-        A tolerance or a duration that is not above 0.
+        If the tolerance or the duration is not above 0.
     """
 
     def __init__(self, clock: Clock, tolerance: float, settle: float) -> None:
@@ -133,7 +135,7 @@ class Steadiness:
         self.jumps = 0
 
     def see(self, seconds: float) -> bool:
-        """Note the present time in s, and return whether it jumped within ``settle``."""
+        """Record the present time in s, and return whether it jumped within ``settle``."""
         now = self._clock.monotonic()
         offset = seconds - now
         if self._offset is None:
@@ -153,10 +155,10 @@ class Steadiness:
 
 
 def kernel_bound() -> float:
-    """Return the kernel's bound on its clock error in s, infinite if the clock is undisciplined.
+    """Return the kernel's bound on its clock error, s; infinite if the clock is undisciplined.
 
-    chronyd (with ``rtcsync``, as packaged) and ntpd report the bound, the root distance to their
-    source, whenever they correct the clock. Between corrections the kernel adds 0.5 ms per second.
+    chronyd (with ``rtcsync``, as packaged) and ntpd report the bound (the root distance to their
+    source) whenever they correct the clock. Between corrections the kernel adds 0.5 ms per second.
     systemd-timesyncd reports 0 instead of the root distance, so use chronyd.
 
     Raises
@@ -165,7 +167,7 @@ def kernel_bound() -> float:
         If the system does not provide the bound.
     """
     ask = getattr(ctypes.CDLL(None, use_errno=True), "adjtimex", None)
-    timex = (ctypes.c_long * 128)()  # zeros query and change nothing; larger than any struct timex
+    timex = (ctypes.c_long * 128)()  # zeros change nothing; larger than any struct timex
     state = -1 if ask is None else int(ask(timex))
     if state < 0:
         raise InputError(
@@ -176,10 +178,10 @@ def kernel_bound() -> float:
 
 
 class _Bound:
-    """The kernel's bound, carried over a restart of the program that renews it.
+    """The kernel's bound, which survives a restart of the program that renews it.
 
     chronyd declares the clock unsynchronised when it starts. The oscillator is not affected, so the
-    previous bound continues to grow unless the clock is set in the meantime.
+    previous bound stays valid and continues to grow, unless the clock is set in the meantime.
     """
 
     def __init__(self, ask: Callable[[], float]) -> None:
@@ -217,15 +219,15 @@ class SystemTime:
     tolerance
         Largest step that does not count as a jump, s.
     bound
-        Function that returns the bound on the clock error in s, infinite if undisciplined:
-        `kernel_bound`. None: ``error`` always applies.
+        Function that returns the bound on the clock error, s, infinite if the clock is
+        undisciplined, such as `kernel_bound`. If None, ``error`` always applies.
     gpsd
-        A receiver that must agree with the clock; run and closed with this object.
+        A receiver that must agree with the clock; it is run and closed with this object.
 
     Raises
     ------
     InputError
-        If an error, tolerance or duration is not above 0.
+        If the error, tolerance or duration is not above 0.
     """
 
     def __init__(
@@ -253,7 +255,7 @@ class SystemTime:
         return self._steadiness.jumps
 
     def time(self) -> Time:
-        """Return the time now."""
+        """Return the current time."""
         utc = self._clock.utc()
         jumped = self._steadiness.see(utc.timestamp())
         error, quality, note = self._judged(utc, jumped=jumped)
@@ -309,7 +311,7 @@ class SystemTime:
                 await sleep_until(self._clock, due)
 
     async def close(self) -> None:
-        """End ``run``."""
+        """Make ``run`` return."""
         self._closing.set()
 
 

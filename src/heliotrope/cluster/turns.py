@@ -1,4 +1,4 @@
-"""Access of tasks to a bus, in turn."""
+"""Access of several tasks to one bus, in turn."""
 
 import asyncio
 import contextlib
@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 
 
 class Turns:
-    """Turns on the bus: first come, first served, but urgent tasks go before all others."""
+    """Turns on the bus: first come, first served, but urgent tasks go before all other tasks."""
 
     def __init__(self) -> None:
         self._busy = False

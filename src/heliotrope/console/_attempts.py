@@ -1,4 +1,4 @@
-"""Recent failed sign-ins: per name and address, per name, and per address.
+"""Recent failed sign-ins, counted per name and address, per name, and per address.
 
 Each of the three counts delays the next attempt, for longer as failures accumulate. Only the first
 blocks guessing (`AN_HOUR` attempts by default); the other two merely slow it down, because an
@@ -25,7 +25,7 @@ V = TypeVar("V")
 
 
 class SignInFailures:
-    """The failures of the last hour.
+    """The failed sign-ins of the last hour.
 
     Parameters
     ----------
@@ -68,15 +68,15 @@ class SignInFailures:
         return max(0.0, until - now)
 
     def known(self, name: str, address: str) -> bool:
-        """Whether a name has signed in from an address."""
+        """Return whether a name has signed in from an address."""
         return (name, address) in self._good
 
     def is_home(self, address: str) -> bool:
-        """Whether anyone has signed in from an address."""
+        """Return whether anyone has signed in from an address."""
         return address in self._homes
 
     def meet(self, name: str, address: str) -> None:
-        """Note that a name has signed in from an address."""
+        """Record that a name has signed in from an address."""
         pair = (name, address)
         if pair not in self._good:
             self._homes[address] += 1
@@ -89,7 +89,7 @@ class SignInFailures:
     def begin(self, name: str, address: str) -> None:
         """Count an attempt as failed until `good` is called.
 
-        Counting only after the slow password check would let many attempts through at once.
+        Counting only after the slow password check would admit many attempts at once.
         """
         now, pair = self._now(), (name, address)
         _kept(self._pairs, pair, self._an_hour, self._largest).append(now)
@@ -109,7 +109,7 @@ class SignInFailures:
                 failures.remove(failure)
 
     def good(self, name: str, address: str) -> None:
-        """Forget the failures of a name at an address where it has signed in, but no others."""
+        """Drop the failures of a name at an address where it has signed in, and no others."""
         pair = (name, address)
         self._pairs.pop(pair, None)
         for failures in (self._names.get(name), self._addresses.get(address)):
@@ -121,7 +121,7 @@ class SignInFailures:
 
 
 def _kept(kept: "OrderedDict[K, deque[V]]", key: K, most: int, largest: int) -> "deque[V]":
-    """Return the failures of a key, which becomes the most recently used."""
+    """Return the failures of a key, and mark the key as most recently used."""
     failures = kept.setdefault(key, deque(maxlen=most))
     kept.move_to_end(key)
     if len(kept) > largest:
@@ -142,7 +142,7 @@ def _own_until(times: Collection[float], now: float, an_hour: int) -> float:
 def _shared_until(
     failures: Collection[tuple[float, Pair]], now: float, free: int, longest: float
 ) -> float:
-    """Return when anyone may try again for a name, or from an address, s."""
+    """Return the time from which any attempt for a name or from an address is allowed, s."""
     recent = [at for at, _ in failures if now - at < SPAN]
     more = len(recent) - free
     return recent[-1] + min(longest, 2.0**more) if more >= 0 else now

@@ -1,4 +1,4 @@
-"""The page's files, read once and served from memory, without a thread or compression each."""
+"""The page's files, which are read and compressed once and then served from memory."""
 
 import gzip
 import hashlib
@@ -12,7 +12,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 STATIC = Path(__file__).with_name("static")
 #: The page's only script from another package; the page of `camera teach` also uses it.
 _CLICKING = Path(__file__).parents[1] / "imaging" / "targets" / "clicking.js"
-#: Smaller responses are not compressed, bytes.
+#: Responses smaller than this are not compressed, bytes.
 SMALL = 1024
 _KINDS = {
     ".css": "text/css",
@@ -65,7 +65,7 @@ class Files:
         self._answers = {path: _answer(path.removeprefix(f"{KEPT}/")) for path in self.paths}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Respond from memory, or pass the request on."""
+        """Respond from memory, or pass the request on to the application."""
         if scope["type"] != "http" or scope["path"] not in self._answers:
             await self._app(scope, receive, send)
             return
@@ -81,7 +81,7 @@ class Files:
 
 
 def _answer(name: str) -> tuple[bytes, bytes, Mapping[str, str]]:
-    """Return a file, plain and compressed, with its headers."""
+    """Return a file, both plain and compressed, with its headers."""
     data = _READ[name]
     known = {
         "Content-Type": f"{_KINDS[Path(name).suffix]}; charset=utf-8",
@@ -93,10 +93,10 @@ def _answer(name: str) -> tuple[bytes, bytes, Mapping[str, str]]:
 
 
 def page(name: str) -> str:
-    """Return the HTML of a page, with the addresses of its files."""
+    """Return the HTML of a page with the addresses of its files."""
     return _READ[f"{name}.html"].decode().replace(_FOLDER, f"{KEPT}/")
 
 
 def takes_gzip(headers: Headers) -> bool:
-    """Whether the browser accepts compressed responses."""
+    """Return whether the browser accepts compressed responses."""
     return "gzip" in headers.get("accept-encoding", "")

@@ -1,4 +1,4 @@
-"""Passwords that are guessed first: common ones and variations, sequences, and the account name.
+"""Passwords that are guessed first: common passwords with variations, sequences, account names.
 
 NIST SP 800-63B, section 3.1.1.2, requires such a list. A longer list would be of little use here,
 because a password has ten characters or more, and guessing is slowed down (see `_attempts`).
@@ -33,12 +33,12 @@ _LEAST_RUN = 4
 
 
 def weakness(password: str, name: str = "") -> str | None:
-    """Return the reason why a password would be guessed early, None if none is known.
+    """Return the reason why a password would be guessed early; None if no reason is known.
 
     Parameters
     ----------
     password
-        As typed.
+        Password as typed.
     name
         Name of the account.
     """
@@ -59,12 +59,12 @@ def weakness(password: str, name: str = "") -> str | None:
 
 
 def _repeated(text: str) -> bool:
-    """Whether a text consists of one part repeated."""
+    """Return whether a text consists of one repeated part."""
     return (text + text).find(text, 1) < len(text)
 
 
 def _running(text: str) -> int:
-    """Return the number of characters of a text in runs along a row, in either direction."""
+    """Return how many characters of a text are in runs along a row, in either direction."""
     rows, count, place = [*_ROWS, *(row[::-1] for row in _ROWS)], 0, 0
     while place < len(text):
         longest = max(_common_run(text, place, row) for row in rows)
@@ -74,7 +74,7 @@ def _running(text: str) -> int:
 
 
 def _common_run(text: str, place: int, row: str) -> int:
-    """Return the length of the run along a row that begins at a given place."""
+    """Return the length of the run along a row that begins at a given position."""
     begin = row.find(text[place])
     if begin < 0:
         return 0
@@ -83,7 +83,7 @@ def _common_run(text: str, place: int, row: str) -> int:
 
 
 def _is_common(word: str) -> bool:
-    """Whether a word is common, or two common words with digits and signs between them."""
+    """Return whether a word is common, or joins two common words with digits and signs."""
     pairs = ((_bare(word[:k]), _bare(word[k:])) for k in range(1, len(word)))
     return word in _COMMON or any(a in _COMMON and b in _COMMON for a, b in pairs)
 

@@ -11,7 +11,7 @@ MOST, SPAN, KINDS = 5, 60.0, 500
 
 
 class Repeated(logging.Filter):
-    """Passes a few lines of each kind within a span, then one line with the number of the others.
+    """Passes a few lines of each kind within a time span, then one line with the suppressed count.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ class Repeated(logging.Filter):
         self._counts: dict[tuple[str, int], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether a line is written."""
+        """Return whether a line is to be written."""
         kind = (record.name, record.lineno)  # never the text, which a stranger may choose
         now = self._now()
         begun, count = self._counts.get(kind, (now, 0))

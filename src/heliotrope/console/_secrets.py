@@ -11,17 +11,17 @@ from heliotrope.errors import InputError
 #: hash.
 SHORTEST, LONGEST = 10, 200
 _HASHER = argon2.PasswordHasher()
-#: Verified if there is no account, so that both cases take the same time.
+#: Hash that is verified if there is no account, so that both cases take the same time.
 _NOBODY = _HASHER.hash(secrets.token_hex(16))
 
 
 def check_password(password: str, name: str = "") -> str:
-    """Return a new password of an account if it is acceptable.
+    """Return the new password of an account if that password is acceptable.
 
     Raises
     ------
     InputError
-        If it is too short, too long, or easily guessed.
+        If the password is too short, too long, or easily guessed.
     """
     if not SHORTEST <= len(password) <= LONGEST:
         raise InputError(
@@ -35,14 +35,14 @@ def check_password(password: str, name: str = "") -> str:
 
 
 def hash_password(password: str) -> str:
-    """Return the argon2id hash, which takes some 50 ms."""
+    """Return the argon2id hash of a password, which takes about 50 ms."""
     return _HASHER.hash(check_password(password))
 
 
 def verify_password(kept: str | None, password: str) -> bool:
     """Return whether a password matches a hash.
 
-    It takes the same time if there is no account, or if the account has no password.
+    The check takes the same time if there is no account, or if the account has no password.
     """
     known = kept if kept is not None and kept.startswith("$argon2") else None
     try:

@@ -10,7 +10,7 @@ def csrf_of(session: str) -> str:
 
 
 def same(word: str, other: str) -> bool:
-    """Return whether two words are equal, in constant time."""
+    """Return whether two texts are equal, in constant time."""
     # JSON may contain half a surrogate pair, for which UTF-8 has no bytes.
     said, meant = (word.encode(errors="surrogatepass") for word in (word, other))
     return hmac.compare_digest(said, meant)

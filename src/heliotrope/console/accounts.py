@@ -61,7 +61,7 @@ async def session(console: AppConsole, who: Anyone) -> models.CallerState:
 async def sign_in(
     console: AppConsole, request: Request, response: Response, body: models.LogIn
 ) -> models.CallerState:
-    """Sign in: the answer sets the session's cookie."""
+    """Sign in; the response sets the session's cookie."""
     if not same_origin(console, request):
         await console.note(SecurityEvent.ORIGIN_REFUSED, request)
         raise HTTPException(403, "this page comes from another site; sign in at the console itself")
@@ -84,9 +84,10 @@ async def sign_out(console: AppConsole, who: Anyone, request: Request, response:
 async def confirm_presence(
     console: AppConsole, who: Anyone, request: Request, body: models.Confirmed
 ) -> None:
-    """Confirm by your own password that you are there; a page that was left alone asks for it.
+    """Confirm with your own password that you are present, after a page was left unattended.
 
-    An order from a session that has ordered nothing for a while is refused by 423 until then.
+    Until then, an order from a session that has not given any order for a while is refused with
+    status 423.
     """
     await confirm(console, who, request, body.own_password)
     console.presence.seen(who.secret)
@@ -101,7 +102,7 @@ async def confirm_presence(
 async def own_password(
     console: AppConsole, who: Anyone, request: Request, response: Response, body: models.OwnPassword
 ) -> None:
-    """Change your own password, or set your first one; your sessions and your tokens end."""
+    """Change your own password, or set your first one; this ends your sessions and tokens."""
     if not await _without_password(console, who):
         await confirm(console, who, request, body.old)
     if body.new == body.old:
@@ -116,9 +117,9 @@ async def own_password(
 async def reset_password(
     console: AppConsole, who: Engineer, request: Request, name: AccountNamed, body: models.Confirmed
 ) -> models.GivenPassword:
-    """Give a person a new password, shown once; all their sessions and tokens end.
+    """Set a new password for a user; this ends all of the user's sessions and tokens.
 
-    It must be changed at first use.
+    The password is shown once and must be changed at first use.
     """
     await confirm(console, who, request, body.own_password)
     if name == who.person.name:
@@ -161,7 +162,7 @@ async def change_account(
     name: AccountNamed,
     body: models.AccountChange,
 ) -> models.AccountState:
-    """Change the role or password of an account, or disable it; not yours."""
+    """Change the role or password of another user's account, or disable the account."""
     await confirm(console, who, request, body.own_password)
     if name == who.person.name and body.password is not None:
         raise HTTPException(409, f"{name}: change your own password with PUT session/password")
@@ -190,7 +191,7 @@ async def change_account(
 
 @router.get("/tokens", response_model=list[models.TokenState], tags=["people"])
 async def tokens(console: AppConsole, who: Anyone) -> list[models.TokenState]:
-    """Return the tokens: your own, or all of them for an engineer."""
+    """Return your own tokens, or all tokens if you are an engineer."""
     listed = await console.ask(lambda: console.people.tokens(_whose(who)))
     return [models.TokenState(**asdict(token)) for token in listed]
 
@@ -199,7 +200,7 @@ async def tokens(console: AppConsole, who: Anyone) -> list[models.TokenState]:
 async def new_token(
     console: AppConsole, who: Anyone, request: Request, body: models.NewToken
 ) -> models.TokenState:
-    """Create a token for a program; its secret is shown in this answer only."""
+    """Create a token for a program; its secret is shown only in this response."""
     await confirm(console, who, request, body.own_password)
     if ROLES[body.role] > who.person.role:
         await refused(console, request, who)
@@ -219,7 +220,7 @@ async def new_token(
 async def revoke(
     console: AppConsole, who: Anyone, request: Request, key: Named, body: models.Confirmed
 ) -> None:
-    """Revoke a token: your own, or any as an engineer."""
+    """Revoke your own token, or any token if you are an engineer."""
     await confirm(console, who, request, body.own_password)
     listed = await console.ask(lambda: console.people.tokens(_whose(who)))
     token = next((token for token in listed if token.key == key), None)
@@ -232,7 +233,7 @@ async def revoke(
 
 
 async def _find(console: Console, name: str, *, password: bool) -> None:
-    """Check that an account exists and, if its password is to be changed, that it may have one."""
+    """Check that an account exists and, if its password is to be changed, may have a password."""
     account = await console.ask(lambda: console.people.account(name))
     if account is None:
         raise HTTPException(404, f"there is no account {name}")
@@ -241,13 +242,13 @@ async def _find(console: Console, name: str, *, password: bool) -> None:
 
 
 async def _without_password(console: Console, who: Caller) -> bool:
-    """Whether a session's account has no password yet, according to the store."""
+    """Return whether a session's account still has no password, according to the store."""
     found = await console.ask(lambda: console.people.account(who.person.name))
     return who.by == "session" and found is not None and found.no_password
 
 
 async def _hashed(console: Console, who: Caller, request: Request, password: str) -> str:
-    """Return the hash of a new password, which a signed-in person has entered."""
+    """Return the hash of a new password that a signed-in user has entered."""
     pair = (who.person.name, console.address(request))
     try:
         async with console.hashing.turn(pair, request.is_disconnected, known=True):
@@ -267,7 +268,7 @@ async def _set_password(
 
 
 def _changes(name: str, change: models.AccountChange) -> str:
-    """Return in one line how an account was changed."""
+    """Return the changes to an account in one line."""
     parts = [name]
     if change.role is not None:
         parts.append(f"role {change.role}")
@@ -279,7 +280,7 @@ def _changes(name: str, change: models.AccountChange) -> str:
 
 
 def _whose(who: Caller) -> str:
-    """Return the name of the person whose tokens a caller may see, "" for all."""
+    """Return the name of the user whose tokens a caller may see; "" for all users."""
     return "" if who.person.role >= Role.ENGINEER else who.person.name
 
 

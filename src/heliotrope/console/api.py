@@ -63,7 +63,7 @@ AccountNamed = Annotated[str, Path(max_length=LONGEST_NAME)]
 
 
 def answer(value: Any) -> JSONResponse:
-    """Return a view; the route describes its model."""
+    """Return a view, whose model the route describes."""
     return JSONResponse(value, headers={"Cache-Control": "no-store"})
 
 
@@ -72,7 +72,7 @@ async def shared(
 ) -> Response:
     """Return a response that is the same for everyone, encoded once for all simultaneous callers.
 
-    It contains nothing about the caller, so its compressed length reveals no secret.
+    The response contains nothing about the caller, so its compressed length reveals no secret.
     """
     key = " ".join((call, *map(str, arguments.values())))
     now, kept = time.monotonic(), console.shared.get(key)
@@ -91,13 +91,16 @@ async def shared(
 
 @router.get("/health", tags=["plant"], responses={})
 async def health(console: AppConsole) -> dict[str, Any]:
-    """Return whether the console answers; open to all, reveals nothing of the plant."""
+    """Return whether the console responds.
+
+    The route is open to all callers, and reveals nothing about the plant.
+    """
     del console
     return {"ok": True, "version": __version__}
 
 
 async def photograph(console: AppConsole, request: Request, who: Anyone, name: Named) -> Response:
-    """Send a photograph only where the page does not show it; no browser keeps one."""
+    """Send a photograph, but only if the page does not show it already; no browser stores it."""
     known = request.headers.get("if-none-match", "").strip('"')
     version = int(known) if known.isdecimal() and len(known) < 16 else -1
     view, jpeg = await console.plant.fetch("photograph", who.person, name=name, known=version)
@@ -111,7 +114,7 @@ async def photograph(console: AppConsole, request: Request, who: Anyone, name: N
 async def command(
     console: AppConsole, who: Operator, request: Request, order: orders.CommandOrder
 ) -> Response:
-    """Give STOW and DEFOCUS as what they are; some others need an engineer."""
+    """Issue a command; STOW and DEFOCUS are issued as such, and some commands need an engineer."""
     name = order.command
     if name in ("STOW", "DEFOCUS"):
         return answer(
@@ -125,7 +128,7 @@ async def command(
 
 
 def _endpoint(name: str, call: Call) -> Callable[..., Any]:
-    """Return the function of a route, which makes a call with the arguments of the request."""
+    """Return the function of a route that makes a call with the arguments of the request."""
 
     async def endpoint(
         console: Console, request: Request, who: Caller, order: Any = None, **parameters: Any
@@ -151,7 +154,7 @@ def _endpoint(name: str, call: Call) -> Callable[..., Any]:
 
 
 def _arguments(call: Call) -> Iterator[Parameter]:
-    """Yield the arguments of a request, from its path, its query, and its body."""
+    """Yield the arguments of a request from its path, its query and its body."""
     method, path = call.request.split()
     hints = get_type_hints(call.arguments, include_extras=True)
     for key, field in call.arguments.model_fields.items():
@@ -205,7 +208,7 @@ for _name, _each in CALLS.items():
 
 @router.websocket("/live")
 async def live(socket: WebSocket) -> None:
-    """Send the live stream; see docs/reference/api-http.md."""
+    """Send the live stream; for its format see docs/reference/api-http.md."""
     console: Console = console_of(socket)
     who = await find_caller(console, socket)
     if who is None or not same_origin(console, socket):
@@ -226,7 +229,7 @@ async def live(socket: WebSocket) -> None:
 
 
 async def _show(console: Console, socket: WebSocket) -> None:
-    """Send the live stream until its viewer leaves, loses the right to it, or the console ends."""
+    """Send the live stream until its viewer leaves or loses access, or the console ends."""
 
     async def follow() -> None:
         # A viewer that has left is detected below, because a closed socket cannot be written to.
@@ -234,7 +237,7 @@ async def _show(console: Console, socket: WebSocket) -> None:
             await console.stream.follow(socket.send_bytes)
 
     async def end() -> None:
-        """Close the socket once its session or token has ended, even if nothing is being sent."""
+        """Close the socket once its session or token has ended, even if no data is being sent."""
         while await _still_known(console, socket):
             await asyncio.sleep(TRUSTED)
         with contextlib.suppress(WebSocketDisconnect, RuntimeError, OSError):
@@ -249,7 +252,10 @@ async def _show(console: Console, socket: WebSocket) -> None:
 
 
 async def _still_known(console: Console, socket: WebSocket) -> bool:
-    """Whether a viewer may continue; if the store does not respond, admitted viewers may."""
+    """Return whether a viewer may continue.
+
+    If the store does not respond, admitted viewers may continue.
+    """
     try:
         return await find_caller(console, socket) is not None
     except HeliotropeError:

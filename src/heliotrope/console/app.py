@@ -1,6 +1,6 @@
 """The application: API, live stream and page for one running plant, in its own process.
 
-`create` creates it; `console.serve` runs it.
+`create` creates the application; `console.serve` runs it.
 """
 
 import asyncio
@@ -68,7 +68,7 @@ def create(plant: RemotePlant, settings: ConsoleSettings | None = None) -> FastA
 
     async def read(used: list[str]) -> dict[Key, Session | ApiToken]:
         found = await plant.valid(used)
-        # Whoever is signed in has a place there, even after a restart of this process.
+        # Every signed-in user has a place there, even after a restart of this process.
         for one in found.values():
             if isinstance(one, Session):
                 attempts.meet(one.name, network_of(one.note))

@@ -38,13 +38,13 @@ T = TypeVar("T")
 FIXED = "field"
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 _API = "/api/v1"
-#: What a person with something outstanding may do: stop the field, see who they are, and leave.
+#: Requests open to a person with an outstanding action: stop the field, see who they are, sign out.
 #: `commands` lets STOW and DEFOCUS pass.
 _ALWAYS = frozenset(
     {("POST", f"{_API}/{path}") for path in ("emergency", "stow", "defocus", "commands")}
     | {(method, f"{_API}/session") for method in ("GET", "HEAD", "DELETE")}
 )
-#: What may be outstanding for a person: what to do about it, and the requests that settle it.
+#: Actions that may be outstanding: what the person must do, and the requests that settle it.
 DUES: dict[str, tuple[str, frozenset[tuple[str, str]]]] = {
     "password": ("change your password first", frozenset({("PUT", f"{_API}/session/password")})),
     "factor": (
@@ -52,8 +52,8 @@ DUES: dict[str, tuple[str, frozenset[tuple[str, str]]]] = {
         frozenset({("POST", f"{_API}/session/factor"), ("PUT", f"{_API}/session/factor")}),
     ),
 }
-#: Requests that a page sends by itself, or that return the authority; they neither show nor require
-#: that a person is present.
+#: Requests that a page sends by itself, or that release the authority; they neither show nor
+#: require that a person is present.
 _BY_ITSELF = frozenset({("PUT", f"{_API}/authority"), ("DELETE", f"{_API}/authority")})
 #: The request that confirms a person's presence after an absence.
 _THERE = ("PUT", f"{_API}/session/presence")
@@ -61,7 +61,7 @@ _THERE = ("PUT", f"{_API}/session/presence")
 
 @dataclass
 class Console:
-    """State that the routes share."""
+    """The state that the routes share."""
 
     plant: RemotePlant
     people: RemotePeople
@@ -73,7 +73,7 @@ class Console:
     #: Queue for password checks.
     hashing: Hashing = field(default_factory=Hashing)
 
-    #: How a trusted proxy identifies users; None: it does not.
+    #: How a trusted proxy identifies users; None if it does not.
     by_proxy: ByProxy | None = None
 
     #: Number of heliostats; 0 before it is known, see `heliostats`.
@@ -93,8 +93,8 @@ class Console:
     async def forget_expired(self) -> None:
         """Remove expired sessions and tokens from the store, and record that they have ended.
 
-        Sessions end by the computer's time. Security events that were only counted are recorded
-        too.
+        Sessions end according to the computer's time. Security events that were only counted are
+        also recorded.
         """
         while True:
             for kind, name, more in self.counter.sums(time.monotonic()):
@@ -115,8 +115,8 @@ class Console:
     ) -> None:
         """Record a security event that a request has caused.
 
-        A flood must not cost the plant one call per event, so events are counted here as in the
-        plant, and `forget_expired` sends the totals.
+        A flood of events must not cost the plant one call per event. Events are therefore counted
+        here as in the plant, and `forget_expired` sends the totals.
         """
         if self.counter.admits(kind, who, time.monotonic()):
             address = self.address(connection)
@@ -126,42 +126,46 @@ class Console:
             await self.plant.note(kind, who, origin, plain(detail))
 
     def address(self, connection: HTTPConnection) -> str:
-        """Return the address from which a request comes, see `address_of`.
+        """Return the address from which a request comes; see `address_of`.
 
-        If the proxy has a secret, a request without it is not believed about its address, because
-        other programs on the proxy's computer also send requests.
+        If the proxy has a secret, the address stated by a request without that secret is not
+        believed, because other programs on the proxy's computer also send requests.
         """
         if self.by_proxy is not None and not self.by_proxy.sends(connection.headers):
             return connection.client.host if connection.client else ""
         return address_of(self.settings, connection)
 
     async def heliostats(self) -> int:
-        """Return the number of heliostats of the plant."""
+        """Return the number of heliostats in the plant."""
         if not self.size:
             self.size = int(await self.plant.ask("size"))
         return self.size
 
     def forget(self) -> None:
-        """Drop the shared answers that a change may have made stale."""
+        """Drop the shared responses that a change may have made stale."""
         fixed = self.shared.get(FIXED)
         self.shared.clear()
         if fixed is not None:
             self.shared[FIXED] = fixed
 
     async def ask(self, work: Callable[[], T]) -> T:
-        """Return the result of work in the store, run in a thread because its disk may be slow.
+        """Return the result of work in the store.
 
-        The threads have no other work, so those that hang do not block anything else.
+        The work runs in a thread because the store's disk may be slow. These threads have no other
+        work, so a thread that hangs does not block anything else.
         """
         return await asyncio.get_running_loop().run_in_executor(self.threads, work)
 
     @property
     def emergency_port(self) -> int:
-        """Port of the path for EMERGENCY alone; 0: none."""
+        """Port of the path for EMERGENCY alone; 0 if there is none."""
         return self.settings.emergency_port or 0
 
     def now(self) -> float:
-        """Return the computer's time, POSIX s, by which sessions end, whatever the plant's time."""
+        """Return the computer's time, POSIX s.
+
+        Sessions end by this time, whatever the plant's time is.
+        """
         return time.time()
 
 
@@ -172,15 +176,15 @@ class Caller:
     Attributes
     ----------
     person
-        Person with the role that applies now.
+        The person, with the role that applies now.
     by
         "session" or "token".
     secret
         Secret of the session or token.
     expires
-        POSIX s; None for never.
+        End of the session or token, POSIX s; None if it never ends.
     owes
-        What the person must do before anything else, see `DUES`; "" if there is nothing.
+        Action that the person must take first, see `DUES`; "" if there is none.
     factor
         Whether the account has a second factor.
     by_proxy
@@ -207,7 +211,7 @@ class Caller:
 
 
 async def app_console(connection: HTTPConnection) -> Console:
-    """Return the console of an application, in the event loop because a thread would cost more."""
+    """Return the console of an application, from the event loop, since a thread would cost more."""
     return console_of(connection)
 
 
@@ -220,10 +224,10 @@ AppConsole = Annotated[Console, Depends(app_console)]
 
 
 async def find_caller(console: Console, connection: HTTPConnection) -> Caller | None:
-    """Return the caller, None if unknown or no longer valid.
+    """Return the caller; None if the caller is unknown or no longer valid.
 
-    EMERGENCY accepts a recently known caller, because it must not wait for a store that is slow or
-    unavailable.
+    EMERGENCY accepts a recently known caller, because an emergency must not wait for a store that
+    is slow or unavailable.
 
     Raises
     ------
@@ -246,7 +250,7 @@ async def find_caller(console: Console, connection: HTTPConnection) -> Caller | 
 
 
 def introduced(console: Console, connection: HTTPConnection) -> Introduced | None:
-    """Return the person whom a trusted proxy identifies; None if there is no proxy or no person."""
+    """Return the person whom a trusted proxy identifies; None without a proxy or a person."""
     address = connection.client.host if connection.client else ""
     if console.by_proxy is None or address not in console.settings.proxies:
         return None
@@ -254,7 +258,7 @@ def introduced(console: Console, connection: HTTPConnection) -> Introduced | Non
 
 
 def _as_introduced(console: Console, connection: HTTPConnection, who: Caller) -> bool:
-    """Whether a session belongs to the person whom the proxy now identifies, with that role."""
+    """Return whether a session belongs to the person, and role, that the proxy now identifies."""
     if who.by != "session":
         return True
     person = introduced(console, connection)
@@ -266,7 +270,7 @@ def _as_introduced(console: Console, connection: HTTPConnection, who: Caller) ->
 def signed_in(console: Console, account: Account | Session, secret: str, expires: float) -> Caller:
     """Return the caller of a session."""
     person, least = person_of(account.name, account.role), console.settings.second_factor
-    has_one = account.factor or account.by_proxy  # for them this is up to the proxy
+    has_one = account.factor or account.by_proxy  # for users of a proxy, this is up to the proxy
     needs_factor = bool(least) and person.role >= ROLES[least] and not has_one
     owes = "password" if account.password_due else "factor" if needs_factor else ""
     return Caller(
@@ -287,7 +291,7 @@ def _is_emergency(connection: HTTPConnection) -> bool:
 
 
 def same_origin(console: Console, connection: HTTPConnection) -> bool:
-    """Whether a request comes from a page of this console, or from no page at all."""
+    """Return whether a request comes from a page of this console, or from no page at all."""
     origin = connection.headers.get("origin")
     if origin is None:
         return True
@@ -303,8 +307,8 @@ async def caller(connection: HTTPConnection, console: AppConsole) -> Caller:
     Raises
     ------
     HTTPException
-        401 if unknown; 403 if a page from elsewhere may have sent the request, or if the caller
-        owes something.
+        401 if the caller is unknown; 403 if a page of another origin may have sent the request, or
+        if the caller must take another action first.
     """
     if FOUND in connection.scope:
         who = cast("Caller | None", connection.scope[FOUND])
@@ -330,7 +334,10 @@ async def caller(connection: HTTPConnection, console: AppConsole) -> Caller:
 
 
 def _attended(console: Console, connection: HTTPConnection, who: Caller) -> Caller:
-    """Return the caller of a session, away or not; a caller who is present counts as seen."""
+    """Return the caller of a session, present or away.
+
+    A caller who is present counts as seen.
+    """
     request = (connection.scope.get("method", "GET"), connection.scope["path"])
     # Users without a password here cannot enter it again; the proxy authenticates them at its own
     # intervals.
@@ -348,7 +355,7 @@ def settle(who: Caller, connection: HTTPConnection) -> None:
     Raises
     ------
     HTTPException
-        423 for a person who must confirm their presence; 403 for any other request.
+        423 if a person must first confirm their presence; 403 if another action is outstanding.
     """
     if who.away:
         raise HTTPException(
@@ -379,7 +386,10 @@ async def refused(console: Console, connection: HTTPConnection, who: Caller) -> 
 
 @dataclass(frozen=True)
 class AtLeast:
-    """A dependency that admits only a minimum role; the guard evaluates it before the body."""
+    """A dependency that admits only a minimum role.
+
+    The guard evaluates it before the body is read.
+    """
 
     role: Role
 

@@ -1,4 +1,4 @@
-"""The two console processes beside the plant: page and API, and the path for EMERGENCY."""
+"""The two console processes beside the plant: one for page and API, one for EMERGENCY."""
 
 import asyncio
 import socket
@@ -25,7 +25,7 @@ class ConsoleProcesses:
     Attributes
     ----------
     page, way
-        The processes.
+        The process for page and API, and the process for EMERGENCY.
     """
 
     def __init__(
@@ -53,11 +53,11 @@ class ConsoleProcesses:
 
     @property
     def settings(self) -> ConsoleSettings:
-        """The settings, with the actual ports once a process has started."""
+        """The settings, which contain the actual ports once a process has started."""
         return self._listeners.settings
 
     async def run(self) -> None:
-        """Keep both running until cancelled."""
+        """Keep both processes running until cancelled."""
         try:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self.emergency.run())

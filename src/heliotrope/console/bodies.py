@@ -1,4 +1,4 @@
-"""Request bodies: maximum size, and JSON structure checked before parsing."""
+"""Request bodies: maximum size, and a check of the JSON structure before parsing."""
 
 import asyncio
 import contextlib
@@ -26,12 +26,12 @@ _OTHER = bytes(sorted(set(range(256)) - set(b"[]{}")))
 
 
 class Incoming:
-    """A `receive` that knows whether the body of its request has ended.
+    """A `receive` function that knows whether the body of its request has ended.
 
     Parameters
     ----------
     receive
-        The server's ``receive``.
+        The server's ``receive`` function.
     headers
         Headers of the request.
     """
@@ -51,8 +51,8 @@ class Incoming:
 
         If a server responds and closes while its client is still sending, the client's system
         discards the response, and the client sees a reset connection instead of the reason for the
-        refusal. A sender that pauses for longer than a second is not waited for, and a sender that
-        waits for permission to send its body (Expect) is not given it.
+        refusal. A sender that pauses for longer than a second is abandoned, and a sender that waits
+        for permission to send its body (Expect) does not get permission.
         """
         length = _length(self._headers)
         if length is None or length > most or "expect" in self._headers:
@@ -64,9 +64,10 @@ class Incoming:
 
 
 async def read_body(receive: Receive, most: int) -> bytes | None:
-    """Return the complete body of a request; None if its sender left or sends more than `most`.
+    """Return the complete body of a request; None if its sender left or sends too much.
 
-    The time limit is that of the connection, which is closed when the limit expires.
+    ``most`` is the maximum length, bytes. The time limit is the connection's limit; the connection
+    is closed when it expires.
     """
     body = bytearray()
     while True:
@@ -81,7 +82,7 @@ async def read_body(receive: Receive, most: int) -> bytes | None:
 
 
 def length_of(headers: Headers, most: int) -> int:
-    """Return the length of a body, bytes; raises `HTTPException` if it is not allowed."""
+    """Return the length of a body, bytes; raise `HTTPException` if it is not allowed."""
     if "transfer-encoding" in headers:
         raise HTTPException(411, "send the length of the body (Content-Length)")
     length = _length(headers)
@@ -91,13 +92,13 @@ def length_of(headers: Headers, most: int) -> int:
 
 
 def _length(headers: Headers) -> int | None:
-    """Return the announced length of a body, bytes, 0 without one; None if it is no number."""
+    """Return the announced length of a body, bytes; 0 if none, None if it is not a number."""
     length = headers.get("content-length", "0")
     return int(length) if length.isascii() and length.isdigit() and len(length) < 20 else None
 
 
 def replayed(body: bytes, receive: Receive) -> Receive:
-    """Return a `receive` that delivers a body which has already been read."""
+    """Return a `receive` function that delivers a body which has already been read."""
     delivered = False
 
     async def again() -> Message:
@@ -124,7 +125,7 @@ def check_json(body: bytes) -> None:
     Raises
     ------
     InputError
-        If it is too deep, or has too many values.
+        If the JSON is nested too deeply, or has too many values.
     """
     if body.count(b"\\") > 2 * _MOST_ESCAPES or body.count(b'"') > 2 * MOST_VALUES:
         raise InputError(f"the body has more than {MOST_VALUES} values")

@@ -1,8 +1,9 @@
 """Users whom a trusted proxy has signed in, for example through OpenID Connect.
 
 The proxy names the user and their groups in headers, and authenticates itself by a shared secret in
-another header. These headers are accepted only from an address in `ConsoleSettings.proxies`.
-Accounts are created and get their role from the groups at each sign-in; they have no password.
+another header. These headers are accepted only from an address in `ConsoleSettings.proxies`. An
+account is created at the first sign-in, and gets its role from the groups at each sign-in; it has
+no password.
 """
 
 import hmac
@@ -41,7 +42,7 @@ class _ProxyFile(BaseModel):
 
 @dataclass(frozen=True)
 class Introduced:
-    """A person as identified by the proxy, and the highest role of their groups; "" for none."""
+    """A person identified by the proxy, with the highest role of their groups; "" for no role."""
 
     name: str
     role: str
@@ -72,12 +73,12 @@ class ByProxy:
 
     @classmethod
     def read(cls, path: Path) -> "ByProxy":
-        """Return the content of a file and of its secret file.
+        """Return the content of a configuration file and of the secret file that it names.
 
         Raises
         ------
         FormatError
-            If one of them cannot be used, or others may read the secret.
+            If a file cannot be used, or others may read the secret.
         """
         document = read_document(path, "proxy", _ProxyFile, (_ProxyFile,))
         place = path.parent / document.secret_file
@@ -94,11 +95,11 @@ class ByProxy:
         return cls(*names, word, document.roles, document.separator)
 
     def sends(self, headers: Headers) -> bool:
-        """Whether the proxy has sent a request, which then carries the secret."""
+        """Return whether a request, which then carries the secret, comes from the proxy."""
         return hmac.compare_digest(headers.get(self.secret, "").encode(), self.word.encode())
 
     def introduced(self, headers: Headers) -> Introduced | None:
-        """Return the person of a request from a proxy; None without the secret or a name."""
+        """Return the person named in a proxy's request; None without the secret or a name."""
         names = [_text(name) for name in headers.getlist(self.person)]
         if not self.sends(headers) or len(names) != 1 or not names[0]:
             return None
@@ -109,7 +110,7 @@ class ByProxy:
 
 
 def _text(header: str) -> str:
-    """Return the text of a header, which is UTF-8; "" if it is not."""
+    """Return the text of a header, which is UTF-8; "" if the header is not valid UTF-8."""
     try:
         return unicodedata.normalize("NFC", header.encode("latin-1").decode())
     except UnicodeError:
@@ -117,7 +118,7 @@ def _text(header: str) -> str:
 
 
 def check_account(who: Introduced, account: Account | None) -> None:
-    """Check that a person whom the proxy identifies may enter.
+    """Check that a person whom the proxy identifies may sign in.
 
     Raises
     ------

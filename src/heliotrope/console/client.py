@@ -1,4 +1,4 @@
-"""A thin client of the HTTP API: for scripts, and for `heliotrope ctl`."""
+"""A thin client of the HTTP API, for scripts and for `heliotrope ctl`."""
 
 from collections.abc import AsyncIterator, Sequence
 from types import TracebackType
@@ -18,7 +18,7 @@ class Client:
     Parameters
     ----------
     token
-        API token; "" for routes that need none.
+        API token; "" for routes that need no token.
     url
         Address of the console.
     timeout
@@ -49,7 +49,7 @@ class Client:
         self._http.close()
 
     def ask(self, method: str, path: str, body: Any = None) -> Any:
-        """Send a request to a path below ``/api/v1/``; return the reply.
+        """Send a request to a path below ``/api/v1/`` and return the reply.
 
         Raises
         ------
@@ -60,11 +60,11 @@ class Client:
         return None if answer.status_code == 204 else answer.json()
 
     def get(self, path: str) -> Any:
-        """Return the reply for a path."""
+        """Return the reply to a GET request for a path."""
         return self.ask("GET", path)
 
     def picture(self, path: str) -> bytes:
-        """Return the JPEG for a path; see `ask`."""
+        """Return the JPEG at a path; see `ask`."""
         return self._request("GET", path, None).content
 
     def _request(self, method: str, path: str, body: Any) -> httpx.Response:
@@ -81,12 +81,12 @@ class Client:
     def command(
         self, name: str, heliostats: Sequence[str] = (), values: Sequence[float] = ()
     ) -> Any:
-        """Send a command; return its state, see `TicketState`."""
+        """Send a command and return its state; see `TicketState`."""
         order = {"command": name, "heliostats": list(heliostats), "values": list(values)}
         return self.ask("POST", "commands", order)
 
     def sign_in(self, name: str, password: str, code: str = "") -> None:
-        """Sign in; later requests are made as this user.
+        """Sign in; later requests are then made as this user.
 
         Raises
         ------

@@ -1,9 +1,9 @@
-"""Console connections: counted, timed, and closed to make room for known callers.
+"""Console connections, which are counted, timed, and closed to make room for known callers.
 
 `Listener` accepts the connections at one address; `Doors` is an application wrapper that notes the
 progress of each connection's request. A connection that has never completed a request from a known
 caller belongs to a stranger. Strangers have few places and short deadlines, and their longest-held
-connection is closed for the next one, so they cannot lock anyone out.
+connection is closed to make room for the next stranger, so they cannot lock anyone out.
 """
 
 import asyncio
@@ -68,7 +68,7 @@ class Limits:
         Time that a stranger's connection may spend in each stage, s. A known caller's body has the
         time that its length requires.
     idle_known, answer_known
-        The same for a connection of a known caller, s.
+        Times that a known caller's connection may be idle or wait for a response, s.
     """
 
     most: int = 1000
@@ -83,7 +83,7 @@ class Limits:
     answer_known: float = 120.0
 
     def within(self, most: int) -> "Limits":
-        """Return the same limits, with at most this many connections."""
+        """Return the same limits with at most this many connections."""
         if most >= self.most:
             return self
         share = max(8, most) / self.most
@@ -102,14 +102,14 @@ class Connection:
     address
         Address of the other end.
     stage, since
-        Stage, and when it began, s.
+        Stage, and the time at which it began, s.
     held
         Time since which it has held its place without progress, s; the end of a handshake is not
         progress.
     known
         When a request of a known caller was last completed, s; None for a stranger.
     transport
-        None during the handshake.
+        Transport of the connection; None during the handshake.
     """
 
     def __init__(self, address: str, line: socket.socket, now: float) -> None:
@@ -123,7 +123,7 @@ class Connection:
 
     @property
     def closed(self) -> bool:
-        """Whether its socket is closed."""
+        """Whether the connection's socket is closed."""
         return self.line.fileno() < 0
 
     @property
@@ -132,20 +132,20 @@ class Connection:
         return self.scope is not None and self.scope.get(FOUND) is not None
 
     def enter(self, stage: Stage, now: float) -> None:
-        """Begin a stage."""
+        """Begin a stage of the connection."""
         self.stage, self.since = stage, now
         if stage is not Stage.HEADER:
             self.held = now
 
     def abort(self) -> None:
-        """Close at once."""
+        """Close the connection at once."""
         if self.transport is not None:
             self.transport.abort()
         elif self.opening is not None:
             self.opening.cancel()
 
     def late(self, limits: Limits, now: float) -> bool:
-        """Whether its stage has taken too long."""
+        """Return whether the connection's stage has taken too long."""
         socket_open = self.scope is not None and self.scope["type"] == "websocket"
         if socket_open and self.present:
             return False  # the server's pings monitor it
@@ -166,9 +166,9 @@ class Listener:
     line
         Listening socket.
     app
-        Application that handles its requests.
+        Application that handles the listener's requests.
     limits
-        Limits of its connections.
+        Limits of the listener's connections.
     shared
         Addresses behind which there are many callers, such as this computer and proxies. They may
         use the places of all strangers.
@@ -233,7 +233,7 @@ class Listener:
         protocol: Protocols,
         tls: TlsSource,
     ) -> bool:
-        """Accept waiting connections; return whether the system had the resources."""
+        """Accept waiting connections; return whether the system had enough resources."""
         for _ in range(_BURST):
             try:
                 line, peer = self.sockets[0].accept()
@@ -273,7 +273,7 @@ class Listener:
         connection.enter(Stage.HEADER, self._now())
 
     def _make_room(self, address: str) -> None:
-        """Close the connection whose place a new connection gets, if the limits are reached."""
+        """Close a connection, if the limits are reached, to make room for a new one."""
         fewest = min(self.limits.address, self.limits.strangers)
         if len(self._strangers) >= fewest or len(self) >= self.limits.most:
             self._sort()
@@ -301,7 +301,7 @@ class Listener:
         connection.abort()
 
     def look(self, stalled: float = 0.0) -> None:
-        """Close overdue connections, and forget those that have gone.
+        """Close overdue connections, and drop the connections that have gone.
 
         Parameters
         ----------
@@ -321,7 +321,7 @@ class Listener:
                 kept.pop(key).abort()
 
     def _sort(self) -> None:
-        """Forget connections that have gone; move those that a known caller now uses."""
+        """Drop connections that have gone, and move connections that a known caller now uses."""
         now = self._now()
         if now - self._sorted < _SOON:
             return
@@ -334,7 +334,7 @@ class Listener:
 
     @contextlib.contextmanager
     def request(self, scope: Scope) -> Iterator[Callable[[], None]]:
-        """Note a request of a connection during a block; yield what to call after its body."""
+        """Track a request during a block; yield the function to be called after its body."""
         key = (tuple(scope["client"] or ()), self.port)
         connection = self._known.get(key) or self._strangers.get(key)
         if connection is None:
@@ -363,7 +363,7 @@ def _close_unopened(connection: Connection, task: "asyncio.Task[None]") -> None:
 
 
 def _rank(connection: Connection) -> tuple[bool, float, int, float]:
-    """Return the order in which connections are closed: first those that await a request."""
+    """Return the rank by which connections are closed, first those that await a request."""
     return (
         connection.present,
         connection.known or 0.0,
@@ -373,7 +373,7 @@ def _rank(connection: Connection) -> tuple[bool, float, int, float]:
 
 
 class Doors:
-    """The wrapper around a listener's application, which notes the progress of each request.
+    """A wrapper around a listener's application that notes the progress of each request.
 
     Parameters
     ----------
@@ -385,7 +385,7 @@ class Doors:
         self._listener = listener
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on."""
+        """Pass a request on to the application."""
         app = self._listener.app
         if scope["type"] == "lifespan":
             await app(scope, receive, send)
@@ -402,7 +402,7 @@ class Doors:
 
 
 def raise_descriptors() -> int:
-    """Raise the number of descriptors that this process may open; return how many are available."""
+    """Raise the number of descriptors that this process may open; return the available number."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     limit = WANTED if hard == resource.RLIM_INFINITY else min(WANTED, hard)
     if soft != resource.RLIM_INFINITY and soft < limit:

@@ -1,4 +1,4 @@
-"""Limits on the request rate: strangers by address, known callers by user."""
+"""Limits on the request rate, for strangers per address and for known callers per user."""
 
 import math
 import time
@@ -34,10 +34,10 @@ class Edge:
         self._large: list[str] = []
 
     async def find(self, console: Console, connection: HTTPConnection) -> Caller | None:
-        """Return the caller, None for a stranger.
+        """Return the caller of a request; None for a stranger.
 
-        A known caller's request never counts as a stranger's. Requests of strangers from an address
-        where someone has signed in never count with those from other addresses.
+        A known caller's request never counts as a stranger's request. Requests of strangers from an
+        address where someone has signed in are counted separately from other addresses.
 
         Raises
         ------
@@ -64,7 +64,7 @@ class Edge:
 
     @contextmanager
     def large(self, who: Caller) -> Iterator[None]:
-        """Hold one of the few places for large bodies.
+        """Hold one of the few places for large bodies during a block.
 
         Raises
         ------

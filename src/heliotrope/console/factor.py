@@ -15,7 +15,10 @@ router = APIRouter(prefix="/api/v1", responses=REFUSALS)
 async def begin_factor(
     console: AppConsole, who: Anyone, request: Request, body: models.Confirmed
 ) -> models.NewFactor:
-    """Make the secret of your second factor, shown once; `PUT session/factor` puts it in force."""
+    """Create the secret of your second factor, shown once.
+
+    `PUT session/factor` activates it.
+    """
     import pyotp
     import segno
 
@@ -30,7 +33,7 @@ async def begin_factor(
 async def confirm_factor(
     console: AppConsole, who: Anyone, request: Request, body: models.FactorCode
 ) -> models.RecoveryCodes:
-    """Put your second factor in force by its first code; the recovery codes are shown once."""
+    """Activate your second factor with its first code; the recovery codes are shown once."""
     if who.by != "session":
         raise HTTPException(403, "a token cannot change a second factor; sign in to do so")
     name = who.person.name
@@ -61,7 +64,10 @@ async def remove_factor(
     name: AccountNamed,
     body: models.ConfirmedTwice,
 ) -> None:
-    """Remove the second factor of another person, whose sessions end; needs one of your own."""
+    """Remove another user's second factor, which ends their sessions.
+
+    This needs a code of your own second factor.
+    """
     if not who.factor:
         raise HTTPException(409, f"{who.person.name}: set up your own second factor first")
     if name == who.person.name:

@@ -35,12 +35,12 @@ LIVE = "/api/v1/live"
 
 
 class Guard:
-    """An ASGI middleware.
+    """An ASGI middleware that checks every request.
 
     Parameters
     ----------
     app
-        Application behind it.
+        Application behind the guard.
     console
         Function that returns the console.
     routes
@@ -55,7 +55,7 @@ class Guard:
         self._app, self._console, self._routes, self._edge = app, console, routes, edge
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, if it is allowed."""
+        """Pass a request on if it is allowed."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -77,12 +77,12 @@ class Guard:
             await _refuse(HTTPException(503, str(error)), scope, incoming, reply)
 
     async def _admit(self, console: Console, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on.
+        """Pass an allowed request on.
 
         Raises
         ------
         HTTPException
-            If it is not allowed.
+            If the request is not allowed.
         """
         connection, headers = HTTPConnection(scope), Headers(scope=scope)
         if not host_known(console.settings, headers.get("host", "")):
@@ -124,7 +124,7 @@ class Guard:
             await self._app(scope, receive, send)
 
     def _route(self, scope: Scope, who: Caller | None) -> RouteMatch:
-        """Return the route of a request; raises `HTTPException` if there is none."""
+        """Return the route of a request; raise `HTTPException` if there is none."""
         route = self._routes.find(scope)
         if route.status == 200:
             return route
@@ -138,7 +138,7 @@ class Guard:
         raise HTTPException(404, "nothing is at this address")
 
     def _dress(self, console: Console, scope: Scope, headers: Any) -> None:
-        """Add the safe headers."""
+        """Add the safe headers to a response."""
         path, policy = scope["path"], POLICY
         if path in PAGES:
             urgent = _urgent(console, scope)
@@ -157,7 +157,7 @@ class Guard:
 
 
 def _urgent(console: Console, scope: Scope) -> str:
-    """Return the origin of the path for EMERGENCY alone, as the page reaches it."""
+    """Return the origin of the EMERGENCY path, as a page sees it."""
     host = parts_of(f"//{Headers(scope=scope).get('host', '')}").hostname or ""
     if not console.emergency_port or not host_known(console.settings, host):
         return ""
@@ -175,7 +175,7 @@ async def _check_body(scope: Scope, body: bytes) -> None:
 
 
 def _elsewhere(path: str, who: Caller | None) -> str | None:
-    """Return the page to which a caller must go before the requested one."""
+    """Return the page to which a caller must go before the requested page."""
     if path not in PAGES or path == "/emergency":
         return None
     if who is None or who.by != "session":

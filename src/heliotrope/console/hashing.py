@@ -1,8 +1,8 @@
-"""Queue for password hashing, which is costly: few checks at a time, and few waiting.
+"""Queue for password hashing, which is costly: few checks run at a time, and few wait.
 
 Users who sign in from where they have signed in before take precedence, and have places that
-strangers cannot take, so guesses with ever new addresses and names cannot lock them out. A client
-that has disconnected loses its place without a check.
+strangers cannot take, so guesses with ever new addresses and names cannot lock these users out. A
+client that has disconnected loses its place without a check.
 """
 
 import asyncio
@@ -17,7 +17,7 @@ from heliotrope.errors import HeliotropeError
 AT_WORK = 2
 #: Number of waiting checks: of strangers, and of users known at their address.
 STRANGERS, KNOWN = 8, 32
-#: Of these, from strangers at one address, and for one known name.
+#: Number of waiting checks from strangers at one address, and for one known name.
 OF_ADDRESS, OF_NAME = 4, 4
 
 
@@ -26,7 +26,7 @@ class CrowdError(HeliotropeError):
 
 
 class GoneError(HeliotropeError):
-    """The caller who was waiting for a check has left."""
+    """The caller left while waiting for a check."""
 
 
 @dataclass(eq=False)
@@ -40,7 +40,7 @@ class _Place:
 
 
 class Hashing:
-    """The queue of one console.
+    """The password-check queue of one console.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class Hashing:
             raise _left(place)
 
     def _full(self, place: _Place) -> bool:
-        """Whether the queue is full for callers of this kind."""
+        """Return whether the queue is full for callers of this kind."""
         alike = [other.pair for other in self._waiting if other.known == place.known]
         name, address = place.pair
         if place.known:
@@ -115,7 +115,7 @@ class Hashing:
         return len(alike) >= STRANGERS or sum(one[1] == address for one in alike) >= OF_ADDRESS
 
     def _pass_on(self) -> None:
-        """Give a turn to the first known caller in the queue, else to the first stranger."""
+        """Give the next turn to the first known caller in the queue, else to the first stranger."""
         place = min(self._waiting, key=lambda one: not one.known, default=None)
         if place is None:
             self._free += 1

@@ -1,4 +1,4 @@
-"""What the request headers say: destination, origin, and client."""
+"""Information in the request headers: destination, origin and client."""
 
 import ipaddress
 from urllib.parse import SplitResult, urlsplit
@@ -8,14 +8,14 @@ from starlette.requests import HTTPConnection
 from heliotrope.console.settings import ConsoleSettings
 
 _COOKIE = "heliotrope_session"
-#: A longer word cannot be the secret of a session or token, characters.
+#: Maximum length of the secret of a session or token, characters.
 LONGEST_SECRET = 200
 #: Request limits of strangers, from one address and from all addresses: rate, 1/s, and burst.
 STRANGER, STRANGERS = (50.0, 200.0), (300.0, 600.0)
 
 
 def host_known(settings: ConsoleSettings, netloc: str) -> bool:
-    """Whether a request addresses this computer by a known name."""
+    """Return whether a request addresses this computer by a known name."""
     host = netloc.rpartition(":")[0] if netloc.rpartition(":")[2].isdigit() else netloc
     return host.lower() in settings.hosts
 
@@ -29,10 +29,10 @@ def parts_of(url: str) -> SplitResult:
 
 
 def address_of(settings: ConsoleSettings, connection: HTTPConnection) -> str:
-    """Return the client address of a request: from a trusted proxy's header, or the other end's.
+    """Return the client address of a request, from a trusted proxy's header or the connection.
 
     Each proxy appends the address that it saw to ``X-Forwarded-For``, so the last address that is
-    not a proxy's counts; whatever a caller writes there precedes it.
+    not a proxy's counts; any address that a caller writes there comes before it.
     """
     address = connection.client.host if connection.client else ""
     if address in settings.proxies:
@@ -47,7 +47,10 @@ def address_of(settings: ConsoleSettings, connection: HTTPConnection) -> str:
 
 
 def network_of(address: str) -> str:
-    """Return the address that is counted; for IPv6 the /64, which one computer may own."""
+    """Return the address that is counted.
+
+    For IPv6 it is the /64 network, which one computer may own.
+    """
     try:
         ip = ipaddress.ip_address(address)
     except ValueError:
@@ -69,9 +72,9 @@ def cookie_of(settings: ConsoleSettings) -> str:
 
 
 def secret_of(settings: ConsoleSettings, connection: HTTPConnection) -> tuple[str, str] | None:
-    """Return kind and secret of the caller's token or session, whether valid or not; None for none.
+    """Return the kind and the secret of the caller's token or session; None if there is none.
 
-    A request with a token never counts as a request of a session.
+    The secret may be invalid. A request with a token never counts as a request of a session.
     """
     bearer = connection.headers.get("authorization", "")
     if bearer:

@@ -1,4 +1,4 @@
-"""The listening sockets of a console: opened once, and kept while its processes restart.
+"""The listening sockets of a console, which stay open while its processes restart.
 
 The plant's process holds the sockets and passes them on, so that connections wait while a process
 starts, and no other program can take a port in the meantime.
@@ -16,7 +16,7 @@ _BACKLOG = 2048
 
 
 class Listeners:
-    """The sockets of the page and of the path for EMERGENCY alone.
+    """The sockets of the page and of the EMERGENCY path.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class Listeners:
     Attributes
     ----------
     settings
-        The same, with the actual ports once `open` has found them.
+        The settings, with the actual ports once `open` has found them.
     """
 
     def __init__(self, settings: ConsoleSettings) -> None:
@@ -35,7 +35,7 @@ class Listeners:
         self._sockets: tuple[socket.socket, socket.socket] | None = None
 
     def open(self) -> tuple[socket.socket, socket.socket]:
-        """Return the sockets, always those of the first call; any thread may call it.
+        """Return the sockets, always the sockets of the first call; any thread may call this.
 
         Raises
         ------
@@ -60,7 +60,7 @@ class Listeners:
         return page, emergency
 
     def _open_way(self, page: int) -> socket.socket:
-        """Open the requested port; by default the next port, or a free one if that is taken."""
+        """Open the requested port; by default the next port or, if that is taken, a free one."""
         host, chosen = self.settings.host, self.settings.emergency_port
         if chosen is not None:
             return _taken(host, chosen, "--emergency-port")

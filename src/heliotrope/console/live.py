@@ -1,8 +1,8 @@
 """The live stream: one message per second, created once for all viewers.
 
-A new viewer gets the whole field, then only rows that changed; `stream` defines the message format.
+A new viewer gets the whole field, then only changed rows; `stream` defines the message format.
 
-A slow viewer misses messages, and then gets the whole field again, because nothing is queued. Each
+Messages are not queued, so a slow viewer misses messages and then gets the whole field again. Each
 user has a few places, and the last places are reserved for users who may command.
 """
 
@@ -74,7 +74,7 @@ class Stream:
         self._problem: str = ""
 
     async def run(self) -> None:
-        """Create a message each period while anyone is watching."""
+        """Create a message in each period while anyone is watching."""
         due = time.monotonic()
         while True:
             await asyncio.sleep(0.1 * self._period)
@@ -118,7 +118,7 @@ class Stream:
 
     @contextlib.contextmanager
     def place(self, who: Person) -> Iterator[None]:
-        """Hold a place for one stream of a person.
+        """Hold a place for one stream of a person during a block.
 
         Raises
         ------
@@ -137,7 +137,7 @@ class Stream:
             self._places -= Counter([who.name])
 
     async def follow(self, send: Callable[[bytes], Any]) -> None:
-        """Send to one viewer until cancelled."""
+        """Send messages to one viewer until cancelled."""
         if self._places.total() == 1:
             await self.make()
         data = await self.whole()

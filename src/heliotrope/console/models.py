@@ -1,4 +1,4 @@
-"""Models of the HTTP API: derived from the plant's views, and for requests about accounts.
+"""Models of the HTTP API: models of the plant's views, and models of requests about accounts.
 
 The models for orders are in `plant.interface.orders`, because the plant checks them again.
 
@@ -36,7 +36,7 @@ def model_of(view: type) -> type[BaseModel]:
 
 
 def json_type(hint: Any) -> Any:
-    """Return the type that describes the JSON of a value of a type."""
+    """Return the type that describes the JSON form of a value of a given type."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if dataclasses.is_dataclass(hint):
         return model_of(typing.cast("type", hint))
@@ -94,13 +94,13 @@ class CallerState(BaseModel):
 
 
 class Confirmed(Strict):
-    """A change of accounts or tokens, which needs your own password again."""
+    """A change of accounts or tokens, which requires your own password again."""
 
     own_password: Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class ConfirmedTwice(Confirmed):
-    """A change that needs your own password and, if you have one, a code of your second factor."""
+    """A change that requires your own password and, if active, a code of your second factor."""
 
     own_code: Code = ""
 
@@ -112,7 +112,7 @@ class FactorCode(Strict):
 
 
 class NewFactor(BaseModel):
-    """The secret of a second factor; it is shown in this answer only."""
+    """The secret of a second factor, which is shown only in this response."""
 
     secret: str = Field(description="Base32")
     uri: str = Field(description="The secret as an authenticator reads it")
@@ -120,7 +120,7 @@ class NewFactor(BaseModel):
 
 
 class RecoveryCodes(BaseModel):
-    """Codes that replace one of a second factor, once each; shown in this answer only."""
+    """Codes that each replace a second-factor code once; shown only in this response."""
 
     codes: list[str]
 
@@ -134,7 +134,7 @@ class NewAccount(Confirmed):
 
 
 class AccountChange(Confirmed):
-    """Changes to an account; null: unchanged."""
+    """Changes to an account; null leaves a field unchanged."""
 
     role: Annotated[str, Field(pattern="^(viewer|operator|engineer)$")] | None = None
     password: Annotated[str, Field(min_length=10, max_length=200)] | None = None
@@ -142,14 +142,14 @@ class AccountChange(Confirmed):
 
 
 class OwnPassword(Strict):
-    """Your password ("" if your account has none yet), and the new one."""
+    """Your password ("" if your account has none yet), and your new password."""
 
     old: Annotated[str, Field(max_length=200)]
     new: Annotated[str, Field(min_length=10, max_length=200)]
 
 
 class GivenPassword(BaseModel):
-    """A new password of a person; it is shown in this answer only."""
+    """A user's new password, which is shown only in this response."""
 
     name: str
     password: str
@@ -164,7 +164,7 @@ class NewToken(Confirmed):
 
 
 class Problem(BaseModel):
-    """Reason of a refusal."""
+    """The reason for a refusal."""
 
     detail: str | list[Any]
 

@@ -1,8 +1,8 @@
-"""Sockets whose other end only listens, with a byte limit on what it may send.
+"""Sockets whose other end only listens, with a byte limit on the data that it may send.
 
 A viewer of the live stream replies to the server's pings and closes the socket; both take only a
-few bytes. Anything else that it sends (messages, parts of an endless message, pings whose replies
-it does not read) would be kept in memory, so a connection that sends more is closed.
+few bytes. All other data that a viewer sends (messages, parts of an endless message, pings whose
+replies it does not read) would be kept in memory, so a connection that sends too much is closed.
 """
 
 import time
@@ -22,7 +22,10 @@ class OneWaySocket(WebSocketsSansIOProtocol):
         self._opened, self._received = time.monotonic(), -1
 
     def data_received(self, data: bytes) -> None:
-        """Accept bytes from the viewer; the first are the request, already read by the server."""
+        """Accept bytes from the viewer.
+
+        The first bytes are the request, which the server has already read.
+        """
         if self._received < 0:
             self._received = 0
         else:

@@ -10,18 +10,19 @@ FIRST = "engineer"
 
 
 def first_start(people: People, now: float) -> str | None:
-    """Create the first account if there is none, and give it a password if it has none.
+    """Create the first account if no account exists; set its password if none is set.
 
     Parameters
     ----------
     people
         Accounts of the store.
     now
-        POSIX s.
+        Time, POSIX s.
 
     Returns
     -------
-    The account's password, to be printed once and changed at first use; None if it already has one.
+    The account's password, to be printed once and changed at first use; None if the account already
+    has a password.
     """
     if not without_password(people, now):
         return None
@@ -31,14 +32,14 @@ def first_start(people: People, now: float) -> str | None:
 
 
 def without_password(people: People, now: float) -> bool:
-    """Create the first account, without a password, if there is none.
+    """Create the first account, without a password, if no account exists.
 
     Parameters
     ----------
     people
         Accounts of the store.
     now
-        POSIX s.
+        Time, POSIX s.
 
     Returns
     -------
@@ -51,5 +52,5 @@ def without_password(people: People, now: float) -> bool:
 
 
 def person_of(name: str, role: str) -> Person:
-    """Return the account as a person who commands."""
+    """Return an account as a person who can issue commands."""
     return Person(name, ROLES[role])

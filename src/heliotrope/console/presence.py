@@ -1,8 +1,8 @@
 """Whether the user of a session is still present: locks a page that was left open.
 
-A page that has given no orders for a while continues to show the field, but its next order requires
-the user's password again. EMERGENCY, DEFOCUS and STOW never do. Automatic requests of a page do not
-count, because it renews the command authority every few seconds.
+A page that has sent no orders for a while continues to show the field, but its next order requires
+the user's password again. EMERGENCY, DEFOCUS and STOW never require it. Automatic requests do not
+count as orders, because a page renews the command authority by itself every few seconds.
 """
 
 from collections import OrderedDict
@@ -14,12 +14,12 @@ _MOST = 2000
 
 
 class Presence:
-    """The last orders of sessions.
+    """The times of the last orders of sessions.
 
     Parameters
     ----------
     idle_s
-        Time after which a person must confirm their presence, s; 0: never.
+        Time after which a person must confirm their presence, s; 0 for never.
     monotonic
         Function that returns the time, s.
     """
@@ -29,12 +29,15 @@ class Presence:
         self._last: OrderedDict[str, float] = OrderedDict()
 
     def away(self, secret: str) -> bool:
-        """Whether a session has ordered nothing for too long; an unknown session begins now."""
+        """Return whether a session has sent no order for too long.
+
+        For an unknown session, the time begins now.
+        """
         now = self._now()
         return 0.0 < self._idle <= now - self._last.setdefault(secret, now)
 
     def seen(self, secret: str) -> None:
-        """Note that the person of a session is present."""
+        """Record that the person of a session is present."""
         self._last[secret] = self._now()
         self._last.move_to_end(secret)
         if len(self._last) > _MOST:

@@ -1,8 +1,8 @@
-"""A console process: started and monitored by the plant's process, and ended with it.
+"""A console process, which the plant's process starts and monitors, and which ends with it.
 
-It reads one line of JSON from standard input: the folder of the plant's sockets, the key, the
-settings, and the descriptor of its listening socket. When standard input ends, the plant has ended,
-and so does this process.
+The process reads one line of JSON from standard input: the folder of the plant's sockets, the key,
+the settings, and the descriptor of its listening socket. When standard input ends, the plant has
+ended, and so does this process.
 """
 
 import asyncio
@@ -46,10 +46,10 @@ class Served(Protocol):
         """Serve until closed."""
 
     async def close(self) -> None:
-        """Stop serving."""
+        """Stop serving, so that ``run`` returns."""
 
     async def address(self) -> str:
-        """Wait until it listens; return its address."""
+        """Wait until the server listens, then return its address."""
         ...
 
 
@@ -61,8 +61,8 @@ def main(work: Callable[[ProcessInput], Coroutine[Any, Any, None]], memory: int)
     work
         Coroutine function that does the work.
     memory
-        Maximum memory of the process, bytes. It bounds what others can make the process keep,
-        before the plant or its computer runs out of memory.
+        Maximum memory of the process, bytes. It limits how much memory others can make the process
+        use, so that the plant or its computer does not run out of memory.
     """
     with contextlib.suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
@@ -101,7 +101,7 @@ async def serve(
     server
         The server.
     connect
-        Maintains the connections to the plant.
+        Coroutine that maintains the connections to the plant.
     beat
         Function that sends a sign of life, with the address of the server.
     """
@@ -115,7 +115,10 @@ async def serve(
 
 
 def _wait_for_the_end(loop: asyncio.AbstractEventLoop, server: Served) -> None:
-    """Close the server when standard input ends; end the process if that takes too long."""
+    """Close the server when standard input ends.
+
+    If closing takes too long, end the process.
+    """
     while sys.stdin.buffer.read(4096):
         pass
     with contextlib.suppress(RuntimeError):
@@ -125,7 +128,7 @@ def _wait_for_the_end(loop: asyncio.AbstractEventLoop, server: Served) -> None:
 
 
 async def _beat(server: Served, beat: Callable[[str], Awaitable[Any]]) -> None:
-    """Send a sign of life every second, with the address."""
+    """Send a sign of life, with the server's address, every second."""
     address = await server.address()
     while True:
         with contextlib.suppress(HeliotropeError):

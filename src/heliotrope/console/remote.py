@@ -55,7 +55,7 @@ class RemotePlant:
         Raises
         ------
         HeliotropeError
-            The plant's error; `AwayError` if the plant does not reply.
+            If the plant raises this error; `AwayError` if the plant does not reply.
         RuntimeError
             If the call failed in the plant because of a program error.
         """
@@ -64,7 +64,7 @@ class RemotePlant:
     async def fetch(
         self, call: str, who: Person | None = None, blob: bytes = b"", /, **arguments: Any
     ) -> tuple[Any, bytes]:
-        """Make a call; return the value and blob of its reply. See `ask`."""
+        """Make a call; return the value and the blob of its reply. See `ask`."""
         known = CALLS.get(call)
         line = self._urgent if known is not None and known.urgent else self._ordinary
         behalf = None if who is None else {"name": who.name, "role": who.role.title}
@@ -92,7 +92,7 @@ class RemotePlant:
 class RemotePeople:
     """Accounts, sessions and tokens in the plant's store, as in `store.people.People`.
 
-    The methods wait for the plant's process, so they are called in threads.
+    The methods wait for the plant's process and must therefore be called in threads.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ class RemotePeople:
             ) from None
 
     def account(self, name: str) -> Account | None:
-        """Return an account, None if the name is unknown."""
+        """Return an account; None if the name is unknown."""
         values = self._ask("account", name=name)
         return None if values is None else Account(**values)
 
@@ -185,12 +185,12 @@ class RemotePeople:
         return tuple(self._ask("confirm_factor", name=name, code=code, now=now))
 
     def check_factor(self, name: str, code: str, now: float) -> Used | None:
-        """Use a code; see `Factors.check`."""
+        """Use a code of a second factor; see `Factors.check`."""
         values = self._ask("check_factor", name=name, code=code, now=now)
         return None if values is None else Used(**values)
 
     def remove_factor(self, name: str) -> bool:
-        """Remove a second factor; see `Factors.remove`."""
+        """Remove an account's second factor; see `Factors.remove`."""
         return bool(self._ask("remove_factor", name=name))
 
     def add_token(

@@ -1,7 +1,7 @@
-"""Whose sessions and tokens are valid: a snapshot of all of them, read from the store as needed.
+"""The valid sessions and tokens with their owners: a snapshot, read from the store as needed.
 
-A caller in the snapshot is recognised at once, also by a process that has never served them. An
-unknown secret waits for the next read, which all such requests share, so requests from strangers
+A caller in the snapshot is recognised at once, even by a process that has never served that caller.
+An unknown secret waits for the next read, which all such requests share, so requests from strangers
 slow down neither the store nor known callers. If the store does not respond, the last snapshot
 determines who may continue, because a store that fails must not blind the control room; the plant
 itself sends no new motion without its record.
@@ -37,8 +37,8 @@ class Roster(Generic[T]):
     Parameters
     ----------
     read
-        Function that returns the owner of each, given the keys of the tokens used since the last
-        read; raises `HeliotropeError` if the store does not respond.
+        Function that returns the owner of each session and token, given the keys of the tokens used
+        since the last read. It raises `HeliotropeError` if the store does not respond.
     monotonic
         Function that returns the time, s.
     """
@@ -59,7 +59,7 @@ class Roster(Generic[T]):
         self._waiting: list[asyncio.Future[None]] = []
 
     async def run(self) -> None:
-        """Read whenever a request waits, and from time to time, until cancelled."""
+        """Read the store whenever a request waits, and from time to time, until cancelled."""
         while True:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(_PERIOD):
@@ -69,7 +69,7 @@ class Roster(Generic[T]):
             await asyncio.sleep(_PAUSE)
 
     async def _read_once(self) -> None:
-        """Read, and answer the requests that were already waiting."""
+        """Read the store, and answer the requests that were already waiting."""
         waiting, self._waiting = self._waiting, []
         used, self._used = self._used, set()
         begun, problem = self._now(), None
@@ -90,7 +90,7 @@ class Roster(Generic[T]):
                 one.set_exception(problem)
 
     async def find(self, by: str, secret: str) -> T | None:
-        """Return the owner of a secret, "session" or "token"; None if there is none.
+        """Return the owner of a secret, a "session" or "token"; None if nobody owns it.
 
         If the store does not respond, an owner in the snapshot is returned, unless the snapshot is
         older than a change that was made here.
@@ -142,7 +142,7 @@ class Roster(Generic[T]):
             return self._last(_key(by, secret), error)
 
     def forget(self) -> None:
-        """Accept nobody on the basis of the present snapshot, because something has changed."""
+        """Accept no caller on the basis of the present snapshot, because something has changed."""
         self._least = self._now()
         self._wanted.set()
 

@@ -1,4 +1,4 @@
-"""The routes of the console, with the role and the body size that each accepts.
+"""The routes of the console, with the role and the body size that each route accepts.
 
 The guard looks a request up here before any of its body is read.
 """
@@ -36,7 +36,7 @@ class RouteMatch:
     status
         200, or 404 or 405 if there is no such route.
     role
-        Minimum role; None: open to all.
+        Minimum role; None if the route is open to all.
     largest, per_heliostat
         Largest body, and size allowed per heliostat of the plant, bytes.
     allow
@@ -96,7 +96,7 @@ def _of(route: BaseRoute) -> RouteMatch:
 
 
 def least_role(dependant: Any) -> Role | None:
-    """Return the minimum role that the dependencies of a route require; None: open to all."""
+    """Return the minimum role that a route's dependencies require; None if it is open to all."""
     roles = [least_role(dependency) for dependency in dependant.dependencies]
     if isinstance(dependant.call, AtLeast):
         roles.append(dependant.call.role)
@@ -106,7 +106,10 @@ def least_role(dependant: Any) -> Role | None:
 
 
 def _largest(model: Any) -> int:
-    """Return the largest body of a model: large if it holds names or points, else a form's."""
+    """Return the largest body of a model.
+
+    It is large if the model contains names or points, otherwise it has the size of a form.
+    """
     kinds = [model, *typing.get_args(model)]
     fields = [
         field.annotation for kind in kinds for field in getattr(kind, "model_fields", {}).values()

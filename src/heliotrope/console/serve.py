@@ -15,7 +15,7 @@ class ConsoleServer(Server):
     Parameters
     ----------
     plant, settings
-        As in `app.create`; the settings contain the actual ports, see `lines`.
+        As in `app.create`; the settings contain the actual ports, see `listeners`.
     line
         Listening socket.
     """

@@ -1,4 +1,4 @@
-"""One listener served by uvicorn: connections counted and timed, certificate renewed."""
+"""One listener served by uvicorn, which counts and times connections and renews certificates."""
 
 import asyncio
 import contextlib
@@ -25,16 +25,16 @@ _LOG = logging.getLogger(__name__)
 class Server(uvicorn.Server):
     """A server for one listener.
 
-    It leaves signals to the owner of the process.
+    The server leaves signals to the owner of the process.
 
     Parameters
     ----------
     app
         The application.
     line
-        Listening socket; it is closed at the end.
+        Listening socket, which is closed at the end.
     limits
-        Limits of its connections if there are enough descriptors.
+        Limits of the connections if there are enough descriptors.
     settings
         Settings of the console.
     page
@@ -85,7 +85,7 @@ class Server(uvicorn.Server):
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Leave signals alone."""
+        """Do nothing, because the owner of the process handles signals."""
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -97,7 +97,7 @@ class Server(uvicorn.Server):
         self.servers = [self.listener]  # type: ignore[list-item]  # what `shutdown` uses
 
     async def main_loop(self) -> None:
-        """Serve until it should end."""
+        """Serve until the server is told to end."""
         config, state = self.config, self.lifespan.state
 
         def protocol() -> asyncio.Protocol:
@@ -117,16 +117,16 @@ class Server(uvicorn.Server):
         await self.serve()
 
     async def close(self) -> None:
-        """Stop serving; viewers are disconnected."""
+        """Stop serving, and disconnect viewers."""
         self.should_exit = True
 
     async def address(self, within: float = 30.0) -> str:
-        """Wait until it listens; return its address.
+        """Wait until the server listens, then return its address.
 
         Raises
         ------
         InputError
-            If it does not listen within some seconds.
+            If the server does not listen within a few seconds.
         """
         loop = asyncio.get_running_loop()
         until = loop.time() + within

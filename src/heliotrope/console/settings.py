@@ -20,12 +20,12 @@ class ConsoleSettings:
     Attributes
     ----------
     host, port
-        Address to bind; port 0 takes a free one.
+        Address to bind; port 0 selects a free port.
     names
         Further names of this computer in a browser's address bar. A request for any other name is
         refused, because a foreign page may resolve its own name to this computer.
     certificate, key
-        TLS certificate and its key, PEM files; None: plain HTTP.
+        TLS certificate and its key, PEM files; None for plain HTTP.
     session_s
         Length of a session, s; 15 min to 7 days.
     sign_ins
@@ -40,13 +40,14 @@ class ConsoleSettings:
     proxies
         Addresses of trusted proxies: ``X-Forwarded-For`` names the caller of their requests.
     people_by_proxy
-        File that states how a trusted proxy identifies users, see `by_proxy`; None: it does not.
+        File that states how a trusted proxy identifies users, see `by_proxy`; None if no proxy
+        identifies users.
     second_factor
         Minimum role that needs a second factor; "" for none.
     emergency_port
-        Port that serves EMERGENCY alone; None: the next one, or a free one if that is taken.
+        Port that serves EMERGENCY alone; None for the next port, or a free port if that is taken.
     idle_s
-        Time without an order after which a page's next order requires the password again, s; 0:
+        Time without an order after which a page's next order requires the password again, s; 0 for
         never.
     notice
         Text shown before sign-in; "" for none.
@@ -115,7 +116,7 @@ class ConsoleSettings:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> "ConsoleSettings":
-        """Return the settings of `values`."""
+        """Return the settings that were stored as `values`."""
         files = {name: Path(values[name]) for name in _FILES if values[name]}
         tuples = {name: tuple(values[name]) for name in ("names", "proxies")}
         return cls(**{**values, **tuples, **files})
@@ -129,7 +130,7 @@ class ConsoleSettings:
 
     @property
     def papers(self) -> tuple[Path, Path] | None:
-        """The certificate and its key, None without TLS."""
+        """The certificate and its key; None if there is no TLS."""
         if self.certificate is None or self.key is None:
             return None
         return self.certificate, self.key
@@ -141,7 +142,7 @@ class ConsoleSettings:
 
     @property
     def secure(self) -> bool:
-        """Whether browsers reach the console over TLS, either its own or that of a proxy."""
+        """Whether browsers reach the console over TLS, the console's own or a proxy's."""
         return self.tls or self.plain
 
     @property
@@ -151,10 +152,10 @@ class ConsoleSettings:
 
     @property
     def for_one(self) -> bool:
-        """Whether a one-time link may sign in, because only browsers on this computer connect.
+        """Whether a one-time link may sign a user in, as only this computer's browsers connect.
 
         This requires that there is no TLS, no proxy that hides the origin of a request, and no
-        second factor due.
+        required second factor.
         """
         asks = self.secure or self.proxies or self.second_factor
         return self.local and not asks
@@ -166,13 +167,13 @@ class ConsoleSettings:
         return frozenset(own.union(name.lower() for name in (self.host, *self.names)))
 
     def address(self, port: int) -> str:
-        """Return the address for a browser."""
+        """Return the console's address for a browser."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'https' if self.tls else 'http'}://{host}:{port}/"
 
 
 def is_loopback(address: str) -> bool:
-    """Whether an address is this machine's own."""
+    """Return whether an address is this computer's own address."""
     try:
         found = ipaddress.ip_address(address)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Sign-in with a name and a password, checked no faster than guessing may proceed."""
+"""Sign-in with a name and a password; checks are slowed to limit guessing."""
 
 import asyncio
 import math
@@ -24,7 +24,7 @@ _WRONG_CODE = "the code is wrong or was used already; wait for the next one"
 async def log_in(
     console: Console, name: str, password: str, code: str, request: Request
 ) -> tuple[Account, str, float]:
-    """Check a password, and the code of a second factor; begin a session.
+    """Check a password and, if necessary, a second-factor code; then begin a session.
 
     Returns
     -------
@@ -122,7 +122,7 @@ def drop_cookie(console: Console, response: Response) -> None:
 
 
 async def _known(console: Console, name: str) -> str:
-    """Return a name if it is an account's, because other text typed there may be a password."""
+    """Return a name if it is an account's name; other text typed there may be a password."""
     known = await console.ask(lambda: console.people.account(name))
     return name if known is not None else ""
 
@@ -135,9 +135,9 @@ async def checked(
     failure: SecurityEvent,
     code: str | None = None,
 ) -> Account:
-    """Return the account for a name and password; a wrong one is recorded as ``failure``.
+    """Return the account for a name and password; a failed check is recorded as ``failure``.
 
-    An account with a second factor needs its code too, unless ``code`` is None.
+    An account with a second factor also needs a code, unless ``code`` is None.
 
     Raises
     ------
@@ -150,7 +150,7 @@ async def checked(
     if (wait := attempts.wait(*keys)) > 0.0:
         await console.note(SecurityEvent.LOCKED_OUT, request, await _known(console, name))
         raise _too_often("too many failed sign-ins", wait)
-    # Counting only after the slow check would let many attempts through at once.
+    # Counting only after the slow check would admit many attempts at once.
     attempts.begin(*keys)
     try:
         known = attempts.known(*keys)
@@ -186,7 +186,7 @@ def _too_often(why: str, wait: float) -> HTTPException:
 async def _use_code(
     console: Console, name: str, code: str, connection: HTTPConnection, failure: SecurityEvent
 ) -> None:
-    """Use a code of a second factor; raises `HTTPException` if it is not right."""
+    """Use a code of a second factor; raise `HTTPException` if the code is wrong."""
     used = await console.ask(lambda: console.people.check_factor(name, code, console.now()))
     if used is None:
         await console.note(failure, connection, name, "wrong code of the second factor")
@@ -199,7 +199,9 @@ async def _use_code(
 async def confirm(
     console: Console, who: Caller, request: Request, password: str, code: str | None = None
 ) -> None:
-    """Check that a person is present: a session, and its owner's password (and code) again.
+    """Check that a person is present.
+
+    This requires a session, and its owner's password (and code) again.
 
     Raises
     ------

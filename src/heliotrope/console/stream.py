@@ -34,7 +34,10 @@ ROW = np.dtype(
 
 
 class RemoteError(HeliotropeError):
-    """The console refused a request; ``status`` is 0 if the console cannot be reached."""
+    """The console refused a request.
+
+    ``status`` is 0 if the console cannot be reached.
+    """
 
     def __init__(self, text: str, status: int = 0) -> None:
         super().__init__(text)
@@ -42,7 +45,7 @@ class RemoteError(HeliotropeError):
 
 
 def changed(before: npt.NDArray[Any], after: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the rows of ``after`` that differ; NaN equals NaN."""
+    """Return the rows of ``after`` that differ from ``before``; NaN equals NaN."""
     width = ROW.itemsize
     old = before.view(np.uint8).reshape(-1, width)
     new = after.view(np.uint8).reshape(-1, width)

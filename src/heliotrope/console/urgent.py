@@ -1,9 +1,9 @@
-"""A separate path for EMERGENCY: a second listener, in its own process, that serves only that.
+"""A separate path for EMERGENCY: a second listener in its own process that serves nothing else.
 
-The page sends its order over the ordinary path and over this one at the same time. Both carry the
-same identifier, so the plant gives the order only once. This process depends on little else, holds
-only the roster of those who may call, and calls the plant through the socket for emergencies alone,
-so whatever blocks or ends the console does not affect it.
+The page sends its order over the ordinary path and over this path at the same time. Both requests
+carry the same identifier, so the plant issues the order only once. This process depends on little
+else, keeps only the roster of permitted callers, and calls the plant through a socket reserved for
+emergencies, so a blocked or ended console does not affect it.
 """
 
 import json
@@ -49,12 +49,12 @@ _DISCARDED = 1 << 14
 _SAID = frozenset({"act", "reason", "call", "csrf"})
 #: Statuses of refusals by the plant.
 _STATUS = {"input": 422, "refused": 409}
-#: Function that makes a call in the plant and returns value and blob.
+#: Function that makes a call in the plant and returns the value and the blob of the reply.
 Ask = Callable[..., Awaitable[tuple[Any, bytes]]]
 
 
 class EmergencyWay:
-    """The application of the second listener: ``POST /api/v1/emergency`` and nothing else.
+    """The application of the second listener, which serves only ``POST /api/v1/emergency``.
 
     Parameters
     ----------
@@ -62,7 +62,8 @@ class EmergencyWay:
         Function that makes a call over the plant's socket for emergencies, like
         `LocalConnection.ask`.
     settings
-        Settings of the console; a browser may send an order only from the page at its port.
+        Settings of the console; a browser may send an order only from the page at the console's
+        port.
 
     Attributes
     ----------
@@ -130,7 +131,9 @@ class EmergencyWay:
     async def _caller(
         self, connection: HTTPConnection, by: str, secret: str
     ) -> dict[str, Any] | None:
-        """Return the caller, None for a stranger; if the store does not respond, as last known.
+        """Return the caller; None for a stranger.
+
+        If the store does not respond, the caller as last known is returned.
 
         Raises
         ------
@@ -150,7 +153,7 @@ class EmergencyWay:
         return found
 
     def _from_page(self, origin: str, host: str) -> bool:
-        """Whether an origin is the page of this console, under the name that the request uses."""
+        """Return whether an origin is the page of this console, under the name in the request."""
         page, own = parts_of(origin), parts_of(f"//{host}")
         try:
             port, name = page.port, page.hostname
@@ -162,7 +165,7 @@ class EmergencyWay:
 
 
 async def _read(headers: Headers, receive: Receive) -> dict[str, Any]:
-    """Return the order in a body; raises `HTTPException` if there is none."""
+    """Return the order in a body; raise `HTTPException` if there is none."""
     body = await bodies.read_body(receive, bodies.length_of(headers, _LARGEST))
     if body is None:
         raise HTTPException(400, "the order is incomplete")

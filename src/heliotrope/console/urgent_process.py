@@ -1,4 +1,4 @@
-"""The process for the EMERGENCY path alone, started by `heliotrope run`; see `urgent`.
+"""The process for the EMERGENCY path, which `heliotrope run` starts; see `urgent`.
 
 ``python -m heliotrope.console.urgent_process``
 """
@@ -22,7 +22,10 @@ _MEMORY = 512 << 20
 
 
 def way_of(plant: LocalConnection, inputs: ProcessInput) -> EmergencyWay:
-    """Return the path for EMERGENCY; an order waits until the plant is connected."""
+    """Return the application of the EMERGENCY path.
+
+    An order waits until the plant is connected.
+    """
 
     async def ask(call: str, arguments: dict[str, Any], **named: Any) -> tuple[Any, bytes]:
         until = time.monotonic() + _CONNECT
@@ -34,7 +37,7 @@ def way_of(plant: LocalConnection, inputs: ProcessInput) -> EmergencyWay:
 
 
 def server_of(way: EmergencyWay, inputs: ProcessInput) -> Server:
-    """Return the server of the path for EMERGENCY."""
+    """Return the server of the EMERGENCY path."""
     return Server(way, inputs.line, LIMITS, inputs.settings, page=False)
 
 

@@ -1,5 +1,6 @@
 """The local controller of one heliostat: pure Python for both MicroPython and CPython.
 
-It imports nothing from the rest of Heliotrope, and from Python only ``math``, ``struct`` and
-``binascii``. It uses no dataclasses, typing, enum or match, and integers for time.
+The package imports nothing from the rest of Heliotrope, and only ``math``, ``struct`` and
+``binascii`` from Python's library. It uses no dataclasses, typing, enum or match, and represents
+times as integers.
 """

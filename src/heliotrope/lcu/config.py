@@ -1,4 +1,4 @@
-"""Settings of a local controller: stored once, validated before they are accepted."""
+"""Settings of a local controller, which are validated before they are accepted."""
 
 import struct
 from binascii import crc32
@@ -36,27 +36,28 @@ class Config:
     Attributes
     ----------
     pointing, drives, axes, stow
-        From SET_ARMATURE, SET_DRIVES with SET_BIAS, SET_LIMITS, SET_STOW; None while missing.
+        Values from SET_ARMATURE, SET_DRIVES with SET_BIAS, SET_LIMITS, SET_STOW; None while
+        missing.
     armature_crc
         CRC-32 of the armature's bytes as received.
     defocus, location, standby
-        Angles (rad), and ENU points (m), the latter None while missing.
+        Defocus angles (rad), and ENU points (m), which are None while missing.
     path
-        ENU points (m) of the safe path from the ground to below the standby point, from SET_WAY;
-        empty: see ``Motion``.
+        ENU points (m) of the safe path from the ground to below the standby point, from SET_WAY; if
+        empty, see ``Motion``.
     azimuth_axis
         The axis (0, 1) that moves first when leaving stow and last when returning, from SET_WAY.
     microsteps, rests
         Microsteps of a full step by axis, and whether the drivers are off between motions, from
         SET_STEPPING.
     serial, firmware, address
-        As in HERE.
+        Values reported in HERE.
     lease_ms, stow_wait_ms, silence_ms
-        Greatest age of the sun; time without it until a defocused heliostat goes to stow; time
-        without any valid message until a heliostat that holds a position is defocused.
+        Maximum age of the sun vector; time without a sun vector until a defocused heliostat goes to
+        stow; time without any valid message until a heliostat that holds a position is defocused.
     slot_ms, ahead_ms, stride
-        Of the ``Stepper``, and of the ``Journal``: at no rate may an axis make more steps than the
-        stride in the time for which segments are emitted ahead.
+        Settings of the ``Stepper`` and of the ``Journal``: at no rate may an axis make more steps
+        than the stride in the time for which segments are emitted ahead.
     """
 
     def __init__(self) -> None:
@@ -79,11 +80,11 @@ class Config:
         self._numbers: list[tuple[Any, ...] | None] = [None, None]
 
     def complete(self) -> bool:
-        """Whether all settings that tracking needs are present and consistent."""
+        """Return whether all settings that tracking needs are present and consistent."""
         return self.pointing is not None and None not in self.drives and self.fits()
 
     def fits(self) -> bool:
-        """Whether the limits are present and the stow position lies within them."""
+        """Return whether the limits are present and the stow position lies within them."""
         if self.stow is None:
             return False
         for axis, steps in zip(self.axes, self.stow):  # noqa: B905 - not in MicroPython
@@ -99,7 +100,7 @@ class Config:
         return good
 
     def take(self, name: str, data: bytes) -> bool:
-        """Accept an item of ``journal.ITEMS``; if invalid, return False and change nothing."""
+        """Accept an item of ``journal.ITEMS``; return False, without a change, if it is invalid."""
         was_complete = self.complete()
         before = self.pointing, self.drives[:], self.axes[:], self.biases, self.stow
         numbers = self._numbers[:]

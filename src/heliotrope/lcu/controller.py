@@ -1,7 +1,7 @@
-"""The controller of one heliostat: messages and time in, actions out; no input or output.
+"""The controller of one heliostat, without input or output: messages and time in, actions out.
 
-Safety rests on three things here: the state table, the sun-vector lease, and that DEFOCUS and STOW
-pass every check. ``wire.Gate`` decides who may command and which frames are new.
+Safety rests on three things here: the state table, the sun-vector lease, and the rule that DEFOCUS
+and STOW pass every check. ``wire.Gate`` decides who may command and which frames are new.
 
 Every call returns the same list of actions, valid until the next call:
 
@@ -76,7 +76,7 @@ HARMLESS = (
 )
 POSE = (states.UNCONFIGURED, states.STOWED, states.LOCKED, states.FAULT)
 MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT)
-#: Messages of class KEY that change neither the pose nor the machine, and those that change the
+#: Messages of class KEY that change neither the pose nor the machine, and messages that change the
 #: pose.
 HARMLESS_SETS = ("SET_POSITION", "SET_DEFOCUS", "SET_ADDRESS")
 POSE_SETS = ("SET_ARMATURE", "SET_BIAS")
@@ -96,25 +96,25 @@ MOST_STEPS = 1 << 29
 
 
 class Controller:
-    """One heliostat.
+    """The controller of one heliostat.
 
     Parameters
     ----------
     config
-        Settings, as from the journal.
+        Settings, loaded from the journal.
     now_ms
         The present tick; see ``ticks``.
     gate
-        Decides which frames may act; None if `on_message` is called directly.
+        Gate that decides which frames may act; None if `on_message` is called directly.
     sensor
         Function that returns the tilt of the mirror; see ``Motion``.
 
     Attributes
     ----------
     state, fault
-        Of ``states.STATES`` and ``names.FAULTS``.
+        Indices in ``states.STATES`` and ``names.FAULTS``.
     supply_mv, temperature_degc
-        For STATUS; set by the caller.
+        Values for STATUS, set by the caller.
     """
 
     def __init__(
@@ -157,9 +157,11 @@ class Controller:
         looping: bool,
         goals: "tuple[int, ...]" = (),
     ) -> "list[tuple[Any, ...]]":
-        """Start from the journal: ``primary, secondary, doubt, state, aim, boots, looping, goals``
-        of ``Journal``, whose items are in the configuration already.
-        """  # noqa: D205 - the names are the summary
+        """Start from the values that ``Journal`` has loaded.
+
+        The arguments are the journal's values of the same names. The journal's items are already in
+        the configuration.
+        """
         self.out.clear()
         motion = self.motion
         motion.declare(primary, secondary, doubt >= 0)
@@ -199,7 +201,7 @@ class Controller:
     # Time.
 
     def _time(self, now_ms: int) -> None:
-        """Charge the time since the last call to everything with a time limit."""
+        """Charge the time since the last call to everything that has a time limit."""
         elapsed = ticks.diff(now_ms, self._seen)
         self._seen = now_ms
         if elapsed < 0:
@@ -225,7 +227,7 @@ class Controller:
         self._lapses(fresh, silent, dark)
 
     def _lapses(self, fresh: bool, silent: bool, dark: bool) -> None:
-        """Pass expired time limits to the state table."""
+        """Pass expired time limits to the state table as events."""
         state, kind = self.state, self.motion.kind
         idle = state == states.IDLE
         follows = kind == RETURN or (idle and kind == STANDBY)
@@ -238,10 +240,10 @@ class Controller:
             self._latched_lapses(silent, dark)
 
     def _latched_lapses(self, silent: bool, dark: bool) -> None:
-        """Handle lost contact with the cluster: the latch stays, but the heliostat leaves.
+        """Handle lost contact with the cluster in LOCKED or FAULT: the heliostat leaves anyway.
 
-        While the cause of a fault is present, nothing moves until the stow delay has passed,
-        because the supply may be failing.
+        The state itself stays. While the cause of a fault is present, nothing moves until the stow
+        delay has passed, because the supply may be failing.
         """
         motion = self.motion
         if motion.parked or motion.at_stow() or motion.leaving():
@@ -257,7 +259,7 @@ class Controller:
             self._event("LAPSED")
 
     def on_tick(self, now_ms: int) -> "list[tuple[Any, ...]]":
-        """Advance in time; call it more often than every ``ahead_ms`` during a motion."""
+        """Advance in time; during a motion, call this more often than every ``ahead_ms``."""
         self.out.clear()
         self._time(now_ms)
         elapsed, self._owed_ms = self._owed_ms, 0
@@ -294,7 +296,7 @@ class Controller:
     # Events.
 
     def _event(self, name: str) -> bool:
-        """Pass an event to the state table; False means that it was refused and nothing changed."""
+        """Pass an event to the state table; return False if it was refused and changed nothing."""
         change = states.transition(self.state, name)
         if change is None:
             return False
@@ -331,8 +333,8 @@ class Controller:
     def on_fault(self, number: int, now_ms: int, halt: bool) -> "list[tuple[Any, ...]]":
         """Latch a fault that the caller has detected; ``halt`` stops the motors at once.
 
-        SWITCH locks instead. While it is present no step is made; the lock remains after it has
-        gone.
+        The cause SWITCH locks the heliostat instead. While SWITCH is present no step is made; the
+        lock remains after SWITCH has gone.
         """
         self.out.clear()
         self._time(now_ms)
@@ -351,11 +353,11 @@ class Controller:
         self._event("FAULTED")
 
     def fault_gone(self, number: int) -> None:
-        """Note that the cause of a fault has gone; the fault itself remains until CLEAR_FAULT."""
+        """Record that the cause of a fault has gone; the fault itself remains until CLEAR_FAULT."""
         self._present &= ~(1 << number)
 
     def halted(self, primary: int, secondary: int) -> "list[tuple[Any, ...]]":
-        """After a fault with ``halt``, subtract signed steps that were emitted but not made."""
+        """Subtract signed steps that were emitted but not made, after a fault with ``halt``."""
         self.out.clear()
         self.motion.halted(primary, secondary)
         self._moving = False
@@ -363,7 +365,7 @@ class Controller:
         return self.out
 
     def _judge(self) -> None:
-        """Latch a fault if the diagnosis found a drive stuck."""
+        """Latch a fault if the diagnosis found a stuck drive."""
         result = self.motion.diagnosis[0]
         for i in (0, 1):
             if result & (4 << i):
@@ -402,13 +404,13 @@ class Controller:
         number, sequence
             Number and sequence number of the message.
         values, payload
-            Its numbers, and the bytes from which they were read; both include the head.
+            The message's numbers, and the bytes from which they were read; both include the head.
         verdict
-            Verdict of the gate: ``messages.DONE`` if it may act.
+            Verdict of the gate: ``messages.DONE`` if the message may act.
         now_ms
             The present tick.
         reply
-            Whether it was sent to this address alone, so that a reply is expected.
+            Whether the message was sent to this address alone, so that a reply is expected.
         """
         self.out.clear()
         self._time(now_ms)
@@ -536,7 +538,7 @@ class Controller:
     # Commands.
 
     def _command(self, name: str, values: "tuple[Any, ...]", payload: bytes) -> int:
-        """Obey a fresh command of the authority; return the result for ACK."""
+        """Carry out a fresh command of the authority; return the result for ACK."""
         if name in ("AIM", "LOCK_AIM", "ROUGH", "STANDBY"):
             return self._adjust(name, values, payload)
         if self._present >> SWITCH and name != "LOCK":
@@ -585,7 +587,10 @@ class Controller:
         return messages.DONE
 
     def _may_go(self, up: bool) -> int:
-        """Return whether the heliostat may leave stow (``up``), or go straight to its aim."""
+        """Return whether the heliostat may leave stow (``up``) or go straight to its aim.
+
+        The result is ``messages.DONE``, or the reason for a refusal.
+        """
         motion = self.motion
         if not (
             (up or motion.ready) and motion.known and self.sun.fresh() and self.fault == NO_FAULT
@@ -611,7 +616,7 @@ class Controller:
         return messages.DONE
 
     def _adjust(self, name: str, values: "tuple[Any, ...]", payload: bytes) -> int:
-        """Set aim, standby point or stepping, without a change of state."""
+        """Set the aim, the standby point or the stepping, without a change of state."""
         motion, config = self.motion, self.config
         if name in ("LOCK_AIM", "ROUGH"):
             if values[0] > 1:
@@ -640,7 +645,7 @@ class Controller:
     # Stored settings.
 
     def _set(self, name: str, values: "tuple[Any, ...]", payload: bytes) -> int:
-        """Accept a setting, in a safe state and at rest; return the result for ACK."""
+        """Accept a setting in a safe state and at rest; return the result for ACK."""
         allowed: tuple[int, ...] = MACHINE
         if name in HARMLESS_SETS:
             allowed = HARMLESS

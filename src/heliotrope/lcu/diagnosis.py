@@ -1,4 +1,4 @@
-"""Motion diagnosis: whether the tilt of the mirror changes when an axis moves a little."""
+"""Motion diagnosis: checks whether the mirror's tilt changes when an axis moves a little."""
 
 import math
 
@@ -16,10 +16,10 @@ MOVED_PRIMARY, MOVED_SECONDARY, STUCK_PRIMARY, STUCK_SECONDARY, NO_SENSOR = 1, 2
 
 
 class Diagnosis:
-    """One diagnosis: at home, with the primary axis moved, with the secondary one moved, at home.
+    """One diagnosis: the tilt at home, after a move of each axis, and back at home.
 
     An accelerometer detects the rotation of an axis except for the component about the vertical. If
-    less than ``NOTICED`` is to be expected, neither MOVED nor STUCK is reported.
+    a tilt change below ``NOTICED`` is expected, neither MOVED nor STUCK is reported.
 
     Parameters
     ----------
@@ -31,9 +31,9 @@ class Diagnosis:
     Attributes
     ----------
     over
-        Whether the last motion is the one back home.
+        Whether the last motion, back to home, has begun.
     result
-        (bits, steps moved of the two axes, last change of tilt x, y in rad).
+        Tuple of bits, steps moved by the two axes, and last change of tilt x, y in rad.
     """
 
     def __init__(self, config: Config, home: "list[int]") -> None:
@@ -43,7 +43,7 @@ class Diagnosis:
         self._tilts: list[tuple[float, float] | None] = []
 
     def advance(self, tilt: "tuple[float, float] | None") -> "list[int]":
-        """Accept the tilt at rest; return the step counts to go to next."""
+        """Accept the tilt at rest; return the step counts of the next motion."""
         self._tilts.append(tilt)
         stage = len(self._tilts)
         steps = [self.home[0], self.home[1]]
@@ -55,7 +55,7 @@ class Diagnosis:
         return steps
 
     def _nudged(self, i: int) -> int:
-        """Return the step counts of an axis after a nudge, within its limits."""
+        """Return step counts with one axis moved a little, within its limits."""
         drive, axis = self.config.drives[i], self.config.axes[i]
         assert drive is not None
         assert axis is not None

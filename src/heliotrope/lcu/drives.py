@@ -1,10 +1,9 @@
 """Drives: conversion from motor steps to a joint angle, and back.
 
-The law is that of ``heliotrope.mechanism.drives``:
-θ = bias + (1 + scale) φ + worm_cos cos u + worm_sin sin u + sag cos φ, where φ is linear in
-the steps (rotary) or follows the law of cosines (jack, with the constants of PAINT).
-`reduced` folds a phase of the sag into the other numbers, so ten numbers and the bias
-are enough.
+The law is the same as in ``heliotrope.mechanism.drives``: θ = bias + (1 + scale) φ + worm_cos cos u
++ worm_sin sin u + sag cos φ, where φ is linear in the steps (rotary) or follows the law of cosines
+(jack, with the constants of PAINT). `reduced` folds a phase of the sag into the other numbers, so
+ten numbers and the bias are enough.
 """
 
 import math
@@ -27,11 +26,11 @@ class Drive:
         ``ROTARY``, ``JACK_RISING`` (φ grows as the triangle's angle falls: σ = 1) or
         ``JACK_FALLING``.
     numbers
-        Ten: angle at 0 steps (rad); rad (jack: m of stroke) per step, signed; jack only: length
-        at 0 steps, distances from the joint to the fixed and the moving end (m); scale; worm
-        (rad, rad, periods per rad of φ or per m of stroke); sag (rad).
+        Ten numbers: angle at 0 steps (rad); rad (jack: m of stroke) per step, signed; for a jack,
+        length at 0 steps and distances from the joint to the fixed and the moving end (m); scale;
+        worm (rad, rad, periods per rad of φ or per m of stroke); sag (rad).
     bias
-        rad.
+        Bias of the joint angle, rad.
 
     Raises
     ------
@@ -63,7 +62,10 @@ class Drive:
         self.folded = self._triangle(k)
 
     def _triangle(self, length: float) -> float:
-        """Return the angle at the joint by the half-angle; exact for folded and stretched jacks."""
+        """Return the triangle's angle at the joint, in a form that is exact for any jack pose.
+
+        The half-angle formula stays exact for folded and stretched jacks.
+        """
         c, r = self.numbers[OFFSET], self.numbers[RADIUS]
         above = (length - (c - r)) * (length + (c - r))
         below = ((c + r) - length) * ((c + r) + length)
@@ -100,10 +102,10 @@ class Drive:
         return (length - n[STROKE]) / n[RATE]
 
     def steps(self, theta: float) -> float:
-        """Return the steps (a real number) at a joint angle (rad); beyond a jack's reach, its end.
+        """Return the steps (a real number) at a joint angle (rad).
 
-        With periodic terms, a bracketed secant (regula falsi with bisection) finds them to a
-        thousandth of a step.
+        Beyond a jack's reach, the result is the end of the jack. With periodic terms, a bracketed
+        secant (regula falsi with bisection) finds the steps to a thousandth of a step.
         """
         phi = (theta - self.bias) / (1.0 + self.numbers[SCALE])
         count = self._of_ideal(phi)
@@ -134,10 +136,10 @@ class Drive:
 def reduced(
     kind: int, numbers: tuple[float, ...], bias: float, phase: float
 ) -> tuple[tuple[float, ...], float]:
-    """Return (numbers, bias), without a phase, of a drive whose sag is sag · cos(φ + phase).
+    """Return numbers and bias without a phase for a drive with the sag sag · cos(φ + phase).
 
-    With φ' = φ + phase the bias takes −(1 + scale) · phase, and a rotary drive's worm, whose
-    argument is a multiple of φ, is turned by that multiple of the phase.
+    With φ' = φ + phase, the bias is increased by −(1 + scale) · phase, and the worm of a rotary
+    drive, whose argument is a multiple of φ, is rotated by that multiple of the phase.
     """
     n = list(numbers)
     n[ZERO] += phase

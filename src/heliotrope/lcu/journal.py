@@ -4,14 +4,14 @@ NOR flash holds two kinds of records, each with a counter and a CRC-32, each wri
 erased flash and not touched again until its block is erased:
 
 *Stored items* are kept in two slots of one block each. A new record goes to the slot that does not
-hold the present one, so that one slot is valid at every instant. Armature, drives and the like are
-stored as the bytes received, so that single precision cannot change them, and their checksum is the
-sender's.
+hold the present one, so that one slot is valid at every instant. Armature, drives and similar items
+are stored as the bytes received, so that single precision cannot change them, and their checksum
+equals the sender's.
 
 *Counts* (step counts, aim, state, boots) change often and are kept in a ring of the other blocks. A
-record is appended where flash is blank; a full block is followed by the next one, which was erased
-in advance, so wear is even and there is always space for a last record when the supply fails. The
-block with the newest record is never erased.
+record is appended where flash is blank. After a full block, writing continues in the next block,
+which was erased in advance; wear is therefore even, and there is always space for a last record
+when the supply fails. The block with the newest record is never erased.
 
 A power failure at any byte of a write or an erasure leaves the old or the new record: a damaged
 record fails its checksum and is skipped (except with probability 2^-32).
@@ -19,11 +19,11 @@ record fails its checksum and is skipped (except with probability 2^-32).
 **Step counts.** Before the first step away from rest, and whenever the next steps would lead
 farther than ``STRIDE`` from the counts in flash, a record "moving" is written; at rest, a record
 "rest". If the newest record says "moving" after a reset, the true counts are within ``STRIDE`` of
-it; ``doubt`` reports this until ``zero``, and accumulates over further power failures. A brown-out
-detector that calls ``brown_out`` prevents it.
+its counts. ``doubt`` reports this uncertainty until ``zero``; it accumulates over further power
+failures. A brown-out detector that calls ``brown_out`` prevents it.
 
-**Marks.** The byte of the state holds marks of the controller beside the state. While one of them,
-``TURNING``, is there, a record of ``GOALS`` holds the goals of the motion in place of the counts.
+**Marks.** The state byte also contains marks of the controller. While the mark ``TURNING`` is set,
+a record ``GOALS`` contains the goals of the motion in place of the counts.
 
 The storage is injected::
 
@@ -47,10 +47,10 @@ if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such mo
         blocks: int
 
         def read(self, offset: int, size: int) -> bytes:
-            """Return bytes."""
+            """Return ``size`` bytes from ``offset``."""
 
         def write(self, offset: int, data: bytes) -> None:
-            """Clear the bits that are clear in ``data``."""
+            """Write ``data``: clear the bits that are 0 in it."""
 
         def erase(self, block: int) -> None:
             """Set all bits of a block."""
@@ -106,13 +106,13 @@ RING_RECORD = "<Iii12sBBH"
 RING_SIZE = 32
 FIRST_RING_BLOCK = 2
 BLANK = b"\xff" * RING_SIZE
-#: Parts of the state byte: the state itself; a motion is under way to its goals; a record of goals.
+#: Parts of the state byte: the state itself; a motion to goals is in progress; a record of goals.
 STATE, TURNING, GOALS = 0x0F, 0x40, 0x0F
 REST, AIM = 0x80, 0x40  # flags; the lower bits: three of doubts, three of boots
 
-#: Greatest distance of the true step counts from the counts in flash, steps.
+#: Maximum distance of the true step counts from the counts in flash, steps.
 STRIDE = 1000
-#: From this many unhealthy boots in a row, the controller stays in FAULT.
+#: After this many consecutive unhealthy boots, the controller stays in FAULT.
 BOOT_LIMIT = 5
 #: A boot is healthy after this time, ms; then the caller reports it.
 HEALTHY_MS = 60000
@@ -120,14 +120,14 @@ MOST = 7
 
 
 def items_of(name: str, payload: bytes) -> "dict[str, bytes]":
-    """Return the items that a message of class KEY sets, with its edition.
+    """Return the items that a message of class KEY sets, and the message's edition.
 
     Parameters
     ----------
     name
         Name of the message.
     payload
-        Its payload with head; ``wire`` ensures that its length fits.
+        Payload of the message with head; ``wire`` ensures that its length fits.
 
     Raises
     ------
@@ -160,38 +160,38 @@ def _newer(counter: int, than: int) -> bool:
 
 
 class Journal:
-    """The journal of one local controller. ``load`` comes first, then ``boot``.
+    """The journal of one local controller; call ``load`` first, then ``boot``.
 
     Parameters
     ----------
     storage
         NOR flash; see the docstring of this module.
     stride
-        Greatest distance of the true step counts from the counts in flash, steps.
+        Maximum distance of the true step counts from the counts in flash, steps.
 
     Attributes
     ----------
     items
-        Stored items, as bytes, by name; without names that were never stored.
+        Stored items, as bytes, by name; items that were never stored are missing.
     damaged
-        Whether flash held data but no complete record of stored items.
+        Whether flash contained data but no complete record of stored items.
     primary, secondary
         Step counts of the newest record.
     rest
-        Whether the newest record written since ``load`` says that nothing moves.
+        Whether the newest record written since ``load`` says that the heliostat is at rest.
     doubts
         How often the counts may have been falsified by up to ``stride``; 7 means 7 times or more,
         or that there was no record of counts at all.
     state
         State of the newest record, with the controller's marks.
     goals
-        Goals of the motion under way, as step counts, or ().
+        Goals of the motion in progress, as step counts; () if there is none.
     aim
-        Aim of the newest record as bytes (three ``f``), or None.
+        Aim of the newest record as bytes (three ``f``); None if there is none.
     boots
-        Total of boots, modulo 65536.
+        Total number of boots, modulo 65536.
     unhealthy
-        Consecutive boots that did not reach a healthy minute; 7 means 7 or more.
+        Number of consecutive boots without a healthy minute; 7 means 7 or more.
     """
 
     def __init__(self, storage: "Storage", stride: int = STRIDE) -> None:
@@ -227,7 +227,7 @@ class Journal:
     # Stored items.
 
     def load(self) -> "dict[str, bytes]":
-        """Read the newest complete records, and return ``items``. Nothing is written."""
+        """Read the newest complete records and return ``items``; nothing is written."""
         self._clear()
         intact = False
         for slot in (0, 1):
@@ -256,14 +256,14 @@ class Journal:
         return items
 
     def store(self, changes: "dict[str, bytes]") -> None:
-        """Store items: all of them or, if interrupted, none; other items stay unchanged.
+        """Store items: all of them or, if interrupted, none of them; other items stay unchanged.
 
         Raises
         ------
         ValueError
             If a name is unknown, or a length is wrong.
         OSError
-            If flash does not hold what was written. The old record is then still complete.
+            If flash does not contain the written record. The old record is then still complete.
         """
         for name in changes:
             if name not in SIZE_OF or len(changes[name]) != SIZE_OF[name]:
@@ -293,12 +293,12 @@ class Journal:
         self._slot, self._slot_counter = slot, counter
 
     def numbers(self, name: str) -> "tuple[Any, ...] | None":
-        """Return an item's numbers, None if it was never stored."""
+        """Return an item's numbers; None if the item was never stored."""
         data = self.items.get(name)
         return None if data is None else struct.unpack(CODES_OF[name], data)
 
     def checksum(self, name: str) -> int:
-        """Return the CRC-32 of an item's bytes, 0 if it was never stored."""
+        """Return the CRC-32 of an item's bytes; 0 if the item was never stored."""
         data = self.items.get(name)
         return 0 if data is None else crc32(data)
 
@@ -306,22 +306,22 @@ class Journal:
 
     @property
     def doubt(self) -> int:
-        """Greatest error of the counts, steps; -1 if the counts are unknown."""
+        """Return the largest possible error of the counts, steps; -1 if the counts are unknown."""
         return self.doubts * self.stride if self.doubts < MOST else -1
 
     @property
     def looping(self) -> bool:
-        """Whether the controller keeps rebooting without a healthy minute."""
+        """Return whether the controller keeps rebooting without a healthy minute."""
         return self.unhealthy >= BOOT_LIMIT
 
     def boot(self) -> None:
-        """Count a boot. From then on there is always room for a last record."""
+        """Count a boot; from then on there always is room for a last record."""
         self.boots = (self.boots + 1) & 0xFFFF
         self.unhealthy = min(self.unhealthy + 1, MOST)
         self._append(self.primary, self.secondary, True)
 
     def healthy(self) -> None:
-        """Record that the controller ran well for ``HEALTHY_MS``."""
+        """Record that the controller has run well for ``HEALTHY_MS``."""
         if self.unhealthy:
             self.unhealthy = 0
             self._append(self.primary, self.secondary, self.rest)
@@ -329,7 +329,9 @@ class Journal:
     def before_steps(
         self, primary: int, secondary: int, next_primary: int, next_secondary: int
     ) -> None:
-        """Ensure, before steps are emitted, that flash stays correct to within ``stride``.
+        """Write a record if the next steps would make flash wrong by more than ``stride``.
+
+        Call this before steps are emitted.
 
         Parameters
         ----------
@@ -356,16 +358,16 @@ class Journal:
         return abs(one - other) > self.stride
 
     def at_rest(self, primary: int, secondary: int) -> None:
-        """Record rest at these counts, and erase the next block in time."""
+        """Record that the axes are at rest at these counts, and erase the next block in time."""
         if not (self.rest and (primary, secondary) == (self.primary, self.secondary)):
             self._append(primary, secondary, True)
         if not self._next_ready and self._place > self._places // 2:
             self._erase_next()
 
     def brown_out(self, primary: int, secondary: int) -> bool:
-        """Write the last record while the supply fails: no erasure, one write of 32 bytes.
+        """Write the last record while the supply fails, with one write of 32 bytes and no erasure.
 
-        Returns whether it was written; after ``boot`` there is always room.
+        Returns whether the record was written; after ``boot`` there always is room.
         """
         if self._place >= self._places and not self._next_ready:
             return False
@@ -373,7 +375,7 @@ class Journal:
         return self._write(primary, secondary, True)
 
     def zero(self, primary: int, secondary: int, doubts: int = 0) -> None:
-        """Declare the present counts: no doubt remains; with ``MOST``, the counts are unknown."""
+        """Declare the present counts, with no doubt left; ``MOST`` doubts mean unknown counts."""
         self.doubts = doubts
         self._append(primary, secondary, True)
 
@@ -458,7 +460,7 @@ class Journal:
         raise OSError("journal: the ring does not hold what was written; replace the board")
 
     def _write(self, primary: int, secondary: int, rest: bool) -> bool:
-        """Write one record, and return whether flash holds it."""
+        """Write one record and return whether flash contains it."""
         self._counter = (self._counter + 1) & 0xFFFFFFFF
         flags = (REST if rest else 0) | (AIM if self.aim is not None else 0)
         flags |= self.doubts << 3 | self.unhealthy
@@ -484,5 +486,5 @@ class Journal:
 
 
 def item_name(number: int) -> str:
-    """Return the name of an item by its number in QUERY_STORED, empty if there is none."""
+    """Return the name of an item by its number in QUERY_STORED; empty if there is none."""
     return ITEMS[number - 1][0] if 1 <= number <= len(ITEMS) else ""

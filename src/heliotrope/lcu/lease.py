@@ -1,4 +1,4 @@
-"""The last sun vector, and how long it may be used."""
+"""The last sun vector, and the time for which it may be used."""
 
 from . import ticks
 
@@ -12,7 +12,7 @@ MODULO = 1 << 32
 #: The sun never moves faster than this, rad/ms: 15.05 arcsec/s (one turn in 86,164 s), seen from
 #: the earth's axis.
 FASTEST = 7.3e-8
-#: For this long after its second, a vector shows the sun's direction to 4 mrad, ms.
+#: For this long after its second, a vector gives the sun's direction to within 4 mrad, ms.
 RECENT_MS = 60_000
 #: Time that distinguishes the vectors of a whole day, ms.
 LONGEST_MS = 1 << 29
@@ -21,7 +21,7 @@ LONGEST_MS = 1 << 29
 class Clock:
     """GPS time between two TIME messages, advanced by ticks.
 
-    ``second`` is None until TIME has arrived, and again after the ticks ran backwards.
+    ``second`` is None until TIME has arrived, and again after the ticks have run backwards.
     """
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class Clock:
         self.ms = 0
 
     def set(self, week: int, time_of_week_ms: int) -> int:
-        """Accept TIME; return the jump in ms, 0 for the first."""
+        """Accept TIME; return the jump of the clock in ms, 0 for the first TIME."""
         second, ms = week * 604_800 + time_of_week_ms // 1000, time_of_week_ms % 1000
         jump = 0 if self.second is None else 1000 * (second - self.second) + ms - self.ms
         self.second, self.ms = second % MODULO, ms
@@ -43,7 +43,7 @@ class Clock:
             self.ms %= 1000
 
     def lose(self) -> None:
-        """Forget the time."""
+        """Forget the time, which is unknown until the next TIME."""
         self.second = None
 
     def since(self, second: int) -> int:
@@ -56,8 +56,8 @@ class Clock:
 class SunLease:
     """The sun's direction and the lease that it grants.
 
-    Only a vector for a later second than all before renews the lease; its time in transit is
-    deducted. If ticks jump, the lease ends early, never late.
+    Only a vector for a later second than all earlier vectors renews the lease; its time in transit
+    is deducted. If ticks jump, the lease ends early, never late.
 
     While the lease runs, a vector must be consistent with the last one: the sun cannot have moved
     further than `FASTEST` allows in the ticks since, with a margin of one lease for the time in
@@ -66,12 +66,13 @@ class SunLease:
     Attributes
     ----------
     since_ms
-        Time since the second of the vector, at most 1,000,000, which is also the value before the
-        first.
+        Time since the second of the last vector, ms, at most 1,000,000, which is also the value
+        before the first vector.
     bad
         Number of refused vectors.
     leaps
-        Number of vectors inconsistent with the last one, refused or, after a lapse, accepted.
+        Number of vectors inconsistent with the previous vector; they are refused or, after a lapse,
+        accepted.
     """
 
     def __init__(self, span_ms: int) -> None:
@@ -84,7 +85,7 @@ class SunLease:
         self.bad = self.leaps = 0
 
     def take(self, values: "tuple[int, ...]", clock: Clock, now: int) -> bool:
-        """Accept SUN; if it is stale, repeated or not a sun vector, return False, renew nothing."""
+        """Accept SUN; return False, without renewal, if it is stale, repeated or no sun vector."""
         second = values[0]
         delay = 0 if clock.second is None else clock.since(second)
         lapsed = self._left.over(now)
@@ -111,7 +112,7 @@ class SunLease:
         return True
 
     def _follows(self, values: "tuple[int, ...]") -> bool:
-        """Return whether the sun can have moved from the last vector to this one."""
+        """Return whether the sun can have moved from the last vector to this vector."""
         gap = 0.0
         for i in (0, 1, 2):
             part = (values[1 + i] - self._sun[i]) / UNIT
@@ -120,17 +121,17 @@ class SunLease:
         return gap <= reach * reach
 
     def look(self, now: int, elapsed: int) -> bool:
-        """Charge the elapsed time, and return whether the lease runs."""
+        """Charge the elapsed time, and return whether the lease is still running."""
         self.since_ms = min(self.since_ms + elapsed, 1_000_000)
         self._passed_ms = min(self._passed_ms + elapsed, LONGEST_MS)
         return not self._left.over(now)
 
     def fresh(self) -> bool:
-        """Whether the lease ran at the last check."""
+        """Return whether the lease was running at the last check."""
         return self._left.left > 0
 
     def age_ms(self) -> int:
-        """Age of the vector; the largest number if there is no fresh vector."""
+        """Return the age of the vector, ms; the largest number if there is no fresh vector."""
         return self.span_ms - self._left.left if self._left.left > 0 else 0xFFFFFFFF
 
     def end(self) -> None:
@@ -138,7 +139,7 @@ class SunLease:
         self._left.end()
 
     def vector(self, ahead_ms: int) -> tuple[float, float, float]:
-        """Return the direction to the sun, of length near 1, ``ahead_ms`` from now."""
+        """Return the direction to the sun ``ahead_ms`` from now, a vector of length near 1."""
         ms = self.since_ms + ahead_ms
         east, north, up = [self._sun[i] + self._rate[i] * ms // 1000 for i in (0, 1, 2)]
         return east / UNIT, north / UNIT, up / UNIT

@@ -1,10 +1,10 @@
-"""All messages of the wire, version 2: one table.
+"""All messages of the bus protocol, version 2, as one table.
 
-A row: number, name, who may send it, codes of the payload, names of its fields, traits. Codes are
-those of ``struct``, little-endian; ``s`` alone means the remaining bytes. A field of several
-numbers has a code with a count ("18d"). Field names end in their unit. The meaning of a message is
-in the comment above its row, from which ``docs/reference/wire.md`` takes it (on a microcontroller a
-comment costs no memory).
+A row contains the number, the name, who may send the message, the codes of the payload, the names
+of its fields, and the traits. Codes are ``struct`` codes, little-endian; ``s`` alone means the
+remaining bytes. A field of several numbers has a code with a count ("18d"). Field names end in
+their unit. The comment above a row states the meaning of the message; ``docs/reference/wire.md``
+takes it from there (on a microcontroller a comment costs no memory).
 
 Who may send a message:
 
@@ -15,10 +15,10 @@ CLUSTER    from the cluster controller, about every second: time, sun, session
 ASK        a query from the cluster controller; it changes nothing
 NODE       a reply from a local controller
 
-Payloads of AUTHORITY and KEY messages begin with a head, which their rows leave out: the
-authority's ``token``; ``expires_s``, the GPS second after which the command is void; and for KEY
-the ``edition``, a number that only increases, kept in the journal, so that a recorded message
-cannot set a stored value again, whatever was reset in between.
+Payloads of AUTHORITY and KEY messages begin with a head, which their rows omit: the authority's
+``token``; ``expires_s``, the GPS second after which the command is void; and for KEY the
+``edition``. The edition is a number that only increases and is kept in the journal, so that a
+recorded message cannot set a stored value again, whatever was reset in between.
 
 GPS seconds count from 6 January 1980 without leap seconds, modulo 2^32.
 
@@ -30,13 +30,13 @@ standby    brings its beam to the standby point
 counts     moves it by step counts, from its present position
 sliced     goes to many heliostats in slices
 releases   ends a lock or a fault
-stands     an idle heliostat stands still after it, and tracks no standby point
+stands     an idle heliostat then stands still, and tracks no standby point
 point      sets a point; only the last one counts
-setting    changes how it moves later; it removes no heliostat from a visit
+setting    changes later motions; removes no heliostat from a visit
 harmless   moves nothing, now or later
 stops      only stops the heliostat; accepted even when no motion may begin
-relative   takes effect again in a second frame
-again      its goal looks like the state before it; a second frame does no harm
+relative   a second frame would take effect again
+again      its goal looks like the state before the command; a second frame does no harm
 stored     written to flash before it is acknowledged
 operator   an operator may send it; other AUTHORITY and KEY messages need an engineer
 manual     an operator who sends it takes the heliostat from automatic control
@@ -159,7 +159,7 @@ MESSAGES = (
 
 
 def having(trait: str) -> "frozenset[str]":
-    """Return the names of the messages with a trait."""
+    """Return the names of the messages that have a trait."""
     return frozenset([row[1] for row in MESSAGES if trait in row[5].split()])
 
 
@@ -198,7 +198,7 @@ def _start(number: int) -> int:
 
 
 def name_of(number: int) -> str:
-    """Return the name of a message number, empty if the table has none."""
+    """Return the name of a message number; empty if the table has no such number."""
     start = _start(number)
     return TABLE[start + 4 : TABLE.find(" ", start)] if start >= 0 else ""
 
@@ -210,7 +210,7 @@ def who_of(number: int) -> int:
 
 
 def codes_of(number: int) -> str:
-    """Return the ``struct`` codes of a message's payload with its head, without byte order.
+    """Return the ``struct`` codes of a message's payload with head, without byte order.
 
     Raises
     ------
@@ -224,7 +224,7 @@ def codes_of(number: int) -> str:
 
 
 def fields_of(number: int) -> list[str]:
-    """Return the names of a message's fields with those of its head."""
+    """Return the names of a message's fields, including the fields of its head."""
     row = ROW_OF[number]
     head = HEADS[row[2]][1] if row[2] in HEADS else ""
     return (head + " " + row[4]).split()

@@ -1,4 +1,4 @@
-"""Motion: how the actions of the state table move the two axes.
+"""Motion of the two axes, according to the actions of the state table.
 
 One motion runs at a time; starting another replaces it. When the heliostat leaves stow, the azimuth
 moves first and the elevation last; the beam then travels along the ground to the foot of the tower
@@ -40,7 +40,7 @@ ELSEWHERE = 0.5
 DWELL_MS = 2000
 #: Rough stepping accumulates this many steps if the full step is unknown.
 ROUGH_STEPS = 16
-#: Drivers that rest are switched off after the motors have rested for this long, ms.
+#: Drivers that may be off are switched off after the motors have been at rest for this long, ms.
 RELEASE_MS = 200
 #: Rest before a diagnosis reads the sensor, ms.
 SETTLE_MS = 500
@@ -54,17 +54,17 @@ class Motion:
     config
         Settings; call `rebuild` after they change.
     sun
-        The lease.
+        The sun-vector lease.
     sensor
-        Function that returns the mirror's tilt measured by an accelerometer as (x, y), rad, or
-        None.
+        Function that returns the mirror's tilt measured by an accelerometer, (x, y), rad, or None
+        if there is no reading.
 
     Attributes
     ----------
     kind
-        The motion that runs.
+        The present motion.
     aim
-        ENU, m, or None before the first.
+        Aim point, ENU, m; None before the first aim.
     ready
         Whether the standby point was reached by the safe path since leaving stow.
     known
@@ -73,14 +73,15 @@ class Motion:
         Whether the heliostat was locked at stow: neither DEFOCUS nor STOW moves it, even if the
         stow position has changed since.
     aside
-        Goals of the defocus that has begun, as step counts; () once it has ended, and the beam
-        rests beside its aim or moves with the sun; None: another motion has begun since.
+        Goals of the defocus that has begun, as step counts; () once the defocus has ended, and the
+        beam rests beside its aim or moves with the sun; None if another motion has begun since.
     blind
-        Direction (1, -1) in which a heliostat with unknown counts may turn away; 0: it has done so.
+        Direction (1, -1) in which a heliostat with unknown counts may turn away; 0 once it has
+        turned away.
     cut, unreachable
-        Whether the last goals were beyond the limits, or the last aim beyond the axes.
+        Whether the last goals were beyond the limits; whether no pose reaches the last aim.
     diagnosis
-        (result, steps moved of the two axes, change of tilt x, y) of the last one.
+        Result of the last diagnosis, steps moved by the two axes, and change of tilt x, y.
     """
 
     def __init__(
@@ -119,9 +120,10 @@ class Motion:
     # The axes.
 
     def rebuild(self) -> None:
-        """Apply the settings; new limits only at rest.
+        """Apply the settings; limits may change only at rest.
 
-        The counts of one heliostat say nothing about another one to which its board has been moved.
+        If the board has been moved to another heliostat, the step counts become unknown, because
+        they do not apply there.
         """
         config = self.config
         if config.pointing is not None:
@@ -148,7 +150,7 @@ class Motion:
         self._knot_ms = 0
 
     def declare(self, primary: int, secondary: int, known: bool) -> None:
-        """Declare the present step counts; only at rest."""
+        """Declare the present step counts, which is allowed only at rest."""
         self.counts[0], self.counts[1] = primary, secondary
         self.known, self.blind, self.aside = known, 1, None
         if self.stepper is not None:
@@ -164,16 +166,16 @@ class Motion:
         return self.counts[i] if self.stepper is None else self.stepper.axes[i].goal
 
     def still(self) -> bool:
-        """Whether nothing moves."""
+        """Return whether both axes are at rest."""
         return self.stepper is None or self.stepper.still()
 
     def following(self) -> bool:
-        """Whether the heliostat tracks the sun, so that its beam stays in place."""
+        """Return whether the heliostat tracks the sun, so that its beam stays in place."""
         kind = self._base if self.kind == DEFOCUS else self.kind
         return kind in (STANDBY, TRACK, SEARCH) and self.sun.fresh()
 
     def at_stow(self) -> bool:
-        """Whether the heliostat is at stow."""
+        """Return whether the heliostat is at stow."""
         stow = self.config.stow
         return (
             self.known
@@ -184,14 +186,14 @@ class Motion:
         )
 
     def leaving(self) -> bool:
-        """Whether a motion is under way that takes the beam off: a defocus, or one to stow."""
+        """Return whether a motion is in progress that takes the beam off: a defocus or a stow."""
         return self.kind in (STOW, RETURN) or (self.kind == DEFOCUS and bool(self.aside))
 
     def may_rest(self, elapsed_ms: int) -> bool:
-        """Return whether the drivers may be off: full steps hold without current.
+        """Return whether the drivers may be off, because the motors rest on full steps.
 
-        Between full steps, a motor without current turns to the nearest full step, which the counts
-        do not register.
+        Full steps hold without current. Between full steps, a motor without current turns to the
+        nearest full step, and the counts do not register this.
         """
         full = self.config.microsteps
         at_rest = self.still() and (self.rough > 0 or not self.following())
@@ -203,7 +205,7 @@ class Motion:
         return self._resting_ms >= RELEASE_MS
 
     def halted(self, primary: int, secondary: int) -> None:
-        """After an emergency stop, subtract these signed steps, which were emitted but not made."""
+        """Subtract signed steps that were emitted but not made, after an emergency stop."""
         self.kind = HOLD
         if self._turns == 1 and not self.still():
             self.blind = -1  # a limit switch ended the blind turn; only the other direction is left
@@ -214,7 +216,7 @@ class Motion:
     # Poses.
 
     def pose(self, aim: tuple[float, float, float], ahead_ms: int) -> "Pose | None":
-        """Return the pose for an aim, some time from now; None if no pose lies within the stops."""
+        """Return the pose for an aim some time from now; None if no pose lies within the stops."""
         pointing = self.config.pointing
         if pointing is None or self.stepper is None:
             return None
@@ -235,7 +237,7 @@ class Motion:
         return True
 
     def _go_angles(self, angles: "list[float]", order: int) -> None:
-        """Go to joint angles, by ``follow`` if order is −1."""
+        """Go to joint angles; if ``order`` is −1, use ``follow``."""
         stepper, steps = self.stepper, [0, 0]
         if stepper is None:
             return
@@ -276,7 +278,10 @@ class Motion:
         return True
 
     def _away(self, i: int, angle: float) -> float:
-        """Return an angle turned away by the defocus, in the other direction if a stop is near."""
+        """Return an angle turned away by the defocus.
+
+        If a stop is near, the angle turns in the other direction.
+        """
         offset = self._offset[i]
         low, high = self._stops[i]
         for away in (angle + offset, angle - offset):
@@ -285,14 +290,14 @@ class Motion:
         return low if angle - low > high - angle else high
 
     def _turn(self) -> "list[float] | None":
-        """Choose by how much a defocus turns; return the final angles of one from standby.
+        """Choose the angles of a defocus; return the final joint angles of a defocus from standby.
 
-        From standby, even if held there, the beam goes down the safe path, and on the way up it
-        goes back along its path, until an axis has turned by its angle or the beam reaches the
-        ground. No other place is known to be off the receiver, because the aim may be on a target.
-        From an aim, the axes turn away from standby, which is beside the receiver. A heliostat held
-        elsewhere, where a person has left it, turns off the aim. Without a recent sun vector, the
-        angles alone decide.
+        From standby, even if held there, the beam goes down the safe path; a beam on its way up
+        goes back along its path. It stops when an axis has turned by its angle or the beam reaches
+        the ground. No other position is known to be off the receiver, because the aim may be on a
+        target. From an aim, the axes turn away from standby, which is beside the receiver. A
+        heliostat that an operator has left elsewhere turns away from its aim. Without a recent sun
+        vector, both axes turn by the configured angles.
         """
         primary, secondary = self._offset = self.config.defocus
         if not self.known or self.sun.since_ms > RECENT_MS:
@@ -324,22 +329,23 @@ class Motion:
     # Actions of the state table.
 
     def hold(self) -> None:
-        """Slow down and stop."""
+        """Slow down and stop both axes."""
         self.kind = HOLD
         if self.stepper is not None:
             self.stepper.stop()
 
     def lock(self) -> None:
-        """Stand still, except for a motion that takes the beam off, which continues to its end."""
+        """Stand still; a motion that takes the beam off, however, continues to its end."""
         if self.leaving():
             self._base = HOLD
         else:
             self.hold()
 
     def defocus(self) -> None:
-        """Turn away from the present position; with unknown counts, once, by the same amount.
+        """Turn away from the present position; with unknown counts, only once.
 
-        A turn that was interrupted by an emergency stop or a reset continues to the same goals.
+        With unknown counts the axes turn by the same amount. A turn that was interrupted by an
+        emergency stop or a reset continues to the same goals.
         """
         if self.kind in (DEFOCUS, STOW):
             return
@@ -385,7 +391,7 @@ class Motion:
         self.aside = (self.goal(0), self.goal(1)) if self.known else None
 
     def stow(self) -> None:
-        """Return by the path of the approach, as far as the sun allows, and go to stow."""
+        """Return along the approach path, as far as the sun allows, and go to stow."""
         if not (self.sun.fresh() and self.config.complete()):
             self.stow_directly()
             return
@@ -411,13 +417,13 @@ class Motion:
             self.stepper.stop()
 
     def stow_directly(self) -> None:
-        """Go to stow at once, azimuth last."""
+        """Go to stow at once; the azimuth moves last."""
         self.ready = False
         if self.parked:
             return
         stow = self.config.stow
         if not self.known or self.stepper is None or stow is None or not self.config.fits():
-            self.defocus()  # stow cannot be found, but the beam can leave
+            self.defocus()  # the stow position cannot be found, but the beam can leave
             return
         self.kind = STOW
         order = SECONDARY_FIRST if self.config.azimuth_axis == 0 else PRIMARY_FIRST
@@ -429,7 +435,7 @@ class Motion:
         self._path, self._place = self.way(), -1
 
     def standby(self) -> None:
-        """Keep the beam on the standby point; hold if it was not reached."""
+        """Keep the beam on the standby point; hold if that point has not been reached."""
         if self.kind == APPROACH:
             self.ready = True
         if self.ready and self.config.standby is not None and self.sun.fresh():
@@ -457,7 +463,7 @@ class Motion:
         return True
 
     def prepare_move(self, primary: int, secondary: int) -> bool:
-        """Prepare a motion to step counts; return False if it leaves the limits."""
+        """Prepare a motion to step counts; return False if the counts are beyond the limits."""
         self._home[0], self._home[1] = primary, secondary
         if self.stepper is None:
             return False
@@ -466,19 +472,19 @@ class Motion:
 
     def move(self) -> None:
         """Go to the prepared step counts."""
-        self.kind, self._target = MOVE, None  # a heliostat held there does not stand at standby
+        self.kind, self._target = MOVE, None  # a heliostat held at step counts is not at standby
         if self.stepper is not None:
             self.stepper.go(self._home[0], self._home[1], BOTH)
 
     def diagnose(self) -> None:
-        """Move each axis a little and back, and read from the sensor whether it moved."""
+        """Move each axis a little and back, and check with the sensor whether it moved."""
         self.hold()
         if self.stepper is not None and self.config.complete():
             self.kind, self._wait_ms = DIAGNOSE, SETTLE_MS
             self._diagnosis = None
 
     def renew(self) -> None:
-        """Note that the aim, the armature or the standby point has changed."""
+        """Apply a change of the aim, the armature or the standby point."""
         self._knot_ms = self._renew_ms = 0
         if self.kind == TRACK:
             self._target = self.aim
@@ -486,7 +492,7 @@ class Motion:
             self._target = self.config.standby
 
     def set_rough(self, steps: int) -> None:
-        """Accumulate this many steps before following; 0 means fine stepping."""
+        """Set the number of steps to accumulate before following; 0 means fine stepping."""
         self.rough = steps
         if self.stepper is not None:
             self.stepper.rough = steps
@@ -498,7 +504,7 @@ class Motion:
     # The safe path.
 
     def way(self) -> "list[tuple[float, float, float]]":
-        """Return points from the ground to standby, close enough to each other."""
+        """Return points of the safe path from the ground to standby, close to each other."""
         config = self.config
         standby = config.standby
         if standby is None or config.pointing is None:
@@ -520,7 +526,7 @@ class Motion:
     def _pieces(
         self, points: "list[tuple[float, float, float]]"
     ) -> "list[tuple[float, float, float]]":
-        """Return the points with intermediate points; see ``PIECE``."""
+        """Return the points of a path with intermediate points; see ``PIECE``."""
         pointing = self.config.pointing
         assert pointing is not None
         path = [points[0]]
@@ -543,7 +549,7 @@ class Motion:
         return path
 
     def _on_path(self) -> str:
-        """Advance along the path; return an event at its end or if no pose reaches it."""
+        """Advance along the path; return an event at its end, or if no pose reaches it."""
         if not self.still():
             return ""
         self._place += 1
@@ -569,7 +575,7 @@ class Motion:
     # Time.
 
     def tick(self, elapsed_ms: int) -> str:
-        """Advance the motion; return an event of the state table, or ""."""
+        """Advance the motion; return an event of the state table, or "" if there is none."""
         self._knot_ms = max(0, self._knot_ms - elapsed_ms)
         self._renew_ms = max(0, self._renew_ms - elapsed_ms)
         self._since_ms = min(self._since_ms + elapsed_ms, KNOT_MS)
@@ -605,7 +611,7 @@ class Motion:
         return ""
 
     def _spin(self, elapsed_ms: int) -> str:
-        """Advance the search from point to point."""
+        """Advance the search from one point to the next."""
         self._wait_ms -= elapsed_ms
         if self._wait_ms > 0 or self._spiral is None or self.aim is None:
             return ""
@@ -620,7 +626,7 @@ class Motion:
         return ""
 
     def _diagnose(self, elapsed_ms: int) -> None:
-        """Advance the diagnosis: a motion, a rest, the next motion."""
+        """Advance the diagnosis: a motion, a rest, then the next motion."""
         stepper = self.stepper
         if stepper is None:
             return

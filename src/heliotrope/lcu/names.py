@@ -1,4 +1,4 @@
-"""Descriptions of the state table and of STATUS, for display; a board does not need them."""
+"""Descriptions of the state table and of STATUS for display, which boards do not need."""
 
 from . import states
 
@@ -54,7 +54,7 @@ MOTIONS = {
 
 
 def transitions() -> list[tuple[int, str, int, str]]:
-    """Return all transitions: state, event, new state, motion or ""."""
+    """Return all transitions: state, event, new state, and motion ("" if none starts)."""
     rows = []
     for line in states.TABLE.split("\n"):
         if line:

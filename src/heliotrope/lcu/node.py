@@ -1,30 +1,30 @@
-"""A complete local controller except for its pins: the program of boards and of the simulator.
+"""A complete local controller except for its pins, as run by boards and by the simulator.
 
-``Node`` joins the reader of frames, the gate, the controller, the journal and the step timer.
-It has no loop, clock or port of its own: bytes and time come in by calls, bytes go out
-by ``write``, steps go to the timer, records go to flash. It boots when it is made; to reset
-it, make another one on the same flash.
+``Node`` joins the reader of frames, the gate, the controller, the journal and the step timer. A
+node has no loop, clock or port of its own: bytes and time come in through calls, bytes go out
+through ``write``, steps go to the timer, and records go to flash. A node boots when it is created;
+to reset it, create another node on the same flash.
 
 ::
 
     node = Node(flash, timer, uart.write, now_ms(), serial=4711, sha256=sha256, key=key)
     while True:
-        node.on_bytes(uart.read(), now_ms())     # when bytes have come
+        node.on_bytes(uart.read(), now_ms())     # when bytes have arrived
         node.on_tick(now_ms())                   # always, every 50 ms or more often
 
 ``now_ms`` is a counter of milliseconds modulo 2^30, like ``time.ticks_ms``; see ``ticks``.
 
 **Replies** carry the sequence number of the frame that requested them, and are sent within the call
-that delivered it, except HERE, which waits for a randomly chosen slot, ``HERE_SLOTS`` of
-``HERE_SLOT_MS`` each. No other message replies to a broadcast query.
+that delivered that frame. The exception is HERE, which waits for a randomly chosen slot,
+``HERE_SLOTS`` of ``HERE_SLOT_MS`` each. HERE is the only reply to a broadcast query.
 
 **Order.** Flash is written before the steps that it records are executed, and before an ACK reports
-that something was stored. An emergency stop takes precedence over everything.
+that something was stored. An emergency stop takes precedence over everything else.
 
 **A journal that fails** latches the fault JOURNAL, which holds until the next reset; from then on
 nothing is written and nothing is stored. The heliostat still moves its beam off the receiver and
-goes to stow, because that protects more than the step counts do; a boot on such flash treats the
-counts as unknown.
+goes to stow, because that is more important than correct step counts; a boot on such flash treats
+the counts as unknown.
 """
 
 import struct
@@ -48,12 +48,12 @@ if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such mo
         def play(self, axis: int, direction: int, count: int, interval_us: int) -> None:
             """Queue ``count`` steps of ``axis`` (0, 1), with ``direction`` 1 or -1.
 
-            The steps follow those already queued for the axis, ``interval_us`` apart. The two axes
-            run independently. The call never blocks.
+            The steps are made after the steps already queued for the axis, ``interval_us`` apart.
+            The two axes run independently. The call never blocks.
             """
 
         def stop(self) -> "tuple[int, int]":
-            """Stop both axes at once; return the signed steps queued but not made, by axis."""
+            """Stop both axes at once; return the signed steps queued but not made, one per axis."""
 
 
 #: Slots in which HERE replies to DISCOVER: their number, and the length of each (ms).
@@ -78,7 +78,7 @@ def no_enable(on: bool) -> None:
 
 
 class Node:
-    """One local controller.
+    """One complete local controller.
 
     Parameters
     ----------
@@ -88,17 +88,18 @@ class Node:
         Step timer: ``play(axis, direction, count, interval_us)``, and ``stop()``, which returns
         the signed steps that were queued but not made.
     write
-        Sends bytes to the cluster controller.
+        Function that sends bytes to the cluster controller.
     now_ms
         The present tick.
     serial, firmware
-        As in HERE.
+        Values reported in HERE.
     sha256
-        The hash, ``sha256(data) -> 32 bytes``; None: nothing can be stored.
+        The hash function, ``sha256(data) -> 32 bytes``; if None, nothing can be stored.
     key
-        Key of this controller; b"": nothing can be stored.
+        Key of this controller; with b"", nothing can be stored.
     sensor
-        Function that returns the mirror's tilt (x, y), rad, or None; see ``Motion``.
+        Function that returns the mirror's tilt (x, y), rad, or None if there is no reading; see
+        ``Motion``.
     feed
         Function that feeds the hardware watchdog.
     drivers
@@ -107,9 +108,9 @@ class Node:
     Attributes
     ----------
     controller, gate, journal, reader, timer
-        The parts.
+        The parts of the node.
     trouble
-        The error of flash that has failed, empty if there is none.
+        The error of flash that has failed; empty if there is none.
     """
 
     def __init__(
@@ -184,7 +185,7 @@ class Node:
         self._obey(own.on_frame(frame, now_ms), now_ms)
 
     def on_tick(self, now_ms: int) -> None:
-        """Advance in time; to be called every 50 ms or more often."""
+        """Advance in time; call this every 50 ms or more often."""
         self._obey(self.controller.on_tick(now_ms), now_ms)
         if self._here and self._slot.over(now_ms):
             values, self._here = self._here, ()
@@ -194,10 +195,11 @@ class Node:
             self._obey([(HEALTHY,)], now_ms)
 
     def on_fault(self, number: int, now_ms: int, halt: bool) -> None:
-        """Latch a fault (of ``controller``) that the board has detected; ``halt`` stops the motors.
+        """Latch a fault of ``controller`` that the board has detected; ``halt`` stops the motors.
 
         The cause counts as present until ``fault_gone``. ``controller.SWITCH``, always with
-        ``halt``, is no fault: the drives have been switched off at the heliostat, and it is locked.
+        ``halt``, is not a fault: it means that the drives have been switched off at the heliostat,
+        which is then locked.
         """
         undone = self.timer.stop() if halt else (0, 0)
         self._obey(self.controller.on_fault(number, now_ms, halt), now_ms)
@@ -205,13 +207,13 @@ class Node:
             self._obey(self.controller.halted(undone[0], undone[1]), now_ms)
 
     def fault_gone(self, number: int) -> None:
-        """Note that the cause of a fault has gone; the fault remains until CLEAR_FAULT."""
+        """Record that the cause of a fault has gone; the fault remains until CLEAR_FAULT."""
         self.controller.fault_gone(number)
 
     def on_supply_failing(self, now_ms: int) -> bool:
-        """Stop and store the step counts, because the supply is failing and milliseconds are left.
+        """Stop and store the step counts, because the supply will fail within milliseconds.
 
-        Returns whether flash holds the counts. The fault SUPPLY is latched; if the supply comes
+        Returns whether flash contains the counts. The fault SUPPLY is latched; if the supply comes
         back without a reset, call ``fault_gone``.
         """
         undone = self.timer.stop()
@@ -236,7 +238,7 @@ class Node:
     # The bus key.
 
     def _begin_bus(self, sha256: "Callable[[bytes], bytes]") -> "BusKeys":
-        """Return the bus keys, whose module is loaded when it is first needed."""
+        """Return the bus keys; their module is loaded when it is first needed."""
         from .signing import BusKeys
 
         if self._bus is None:
@@ -292,7 +294,7 @@ class Node:
             self.on_fault(controller.JOURNAL, now_ms, False)
 
     def _keep(self, kind: int, action: "tuple[Any, ...]") -> bool:
-        """Carry out actions on the journal; return False if flash failed, now or before."""
+        """Carry out actions on the journal; return False if flash fails or has failed before."""
         journal = self.journal
         if self.trouble:
             return False
@@ -326,7 +328,10 @@ class Node:
         self._slot.start(now_ms, self._draw(now_ms) * HERE_SLOT_MS)
 
     def _draw(self, now_ms: int) -> int:
-        """Draw a slot, different for each controller and each time; Marsaglia's xorshift."""
+        """Draw a slot at random, with Marsaglia's xorshift.
+
+        The slots differ between controllers and between calls.
+        """
         chance = self._chance ^ now_ms or 1
         chance ^= (chance << 13) & 0xFFFFFFFF
         chance ^= chance >> 17

@@ -1,13 +1,14 @@
 """Pointing: joint angles at which an armature sends sunlight to an aim point.
 
-The law is that of ``heliotrope.mechanism.tracking``, written for a board with 32-bit
-floats: R(a, θ₁) R(b, θ₂) n₀ = v is met where z = R(b, θ₂) n₀ has z·a = v·a and z·b = n₀·b
-(second Paden-Kahan subproblem; two such z, hence two branches). The vertex moves with the
-angles and v with the vertex: fixed point first, damped Gauss-Newton where it is slow.
+The law is the same as in ``heliotrope.mechanism.tracking``, written for a board with 32-bit floats:
+R(a, θ₁) R(b, θ₂) n₀ = v is met where z = R(b, θ₂) n₀ has z·a = v·a and z·b = n₀·b (second
+Paden-Kahan subproblem; two such z, hence two branches). The vertex moves with the angles, and v
+moves with the vertex. This is solved by fixed-point iteration, or by damped Gauss-Newton where that
+iteration is slow.
 
-So that single precision keeps its digits, all points are taken relative to the primary
-axis's origin, lengths across an axis are computed from the part across and never as
-1 − cosine², and angles by atan2.
+To preserve single precision, all points are taken relative to the primary axis's origin, lengths
+across an axis are computed from the perpendicular component and never as 1 − cosine², and angles
+are computed with atan2.
 """
 
 import math
@@ -22,16 +23,17 @@ TOLERANCE = 2e-10
 #: Newton replaces the fixed-point iteration if a step reduces the error by less than this factor.
 SLOW = 0.3
 STEPS, NEWTON_STEPS, TRIALS = 20, 60, 20
-#: Source and aim are closer to opposite than this (rad), or the aim is nearer to the vertex (m).
+#: A pose is degenerate if source and aim are closer to opposite than this (rad), or if the aim is
+#: nearer to the vertex than this (m).
 DEGENERATE_LIMIT = 1e-6
-#: A pose on the branch of the last one that moves less than this (rad) is taken at once.
+#: A pose on the branch of the last pose that moves less than this (rad) is accepted at once.
 CLOSE = 0.05
 #: A pose on the last branch that moves less than this (rad) is accepted at once.
 STOP_SLACK = 1e-6
 
 
 def epsilon(number: float) -> float:
-    """Return the rounding of numbers of the type of ``number`` (1.0)."""
+    """Return the rounding error of numbers of the same type as ``number`` (1.0)."""
     step = number
     while number + 0.5 * step != number:
         step = 0.5 * step
@@ -39,7 +41,10 @@ def epsilon(number: float) -> float:
 
 
 def into_stops(theta: float, low: float, high: float, near: float) -> tuple[float, bool]:
-    """(angle, inside): theta + 2πk within the stops and nearest to ``near``, or the nearer stop."""
+    """Return theta + 2πk within the stops and nearest to ``near``, and True.
+
+    If no such angle lies within the stops, the nearer stop and False are returned.
+    """
     turn = 2.0 * math.pi
     theta += turn * math.floor((near - theta) / turn + 0.5)
     if theta < low - STOP_SLACK:
@@ -74,8 +79,8 @@ class Pointing:
     Parameters
     ----------
     numbers
-        18: primary axis, point on it, secondary axis, point on it, vertex, normal, at zero
-        joint angles; ENU, m. As of ``heliotrope.mechanism.armature``.
+        18 numbers as in ``heliotrope.mechanism.armature``: primary axis, a point on it, secondary
+        axis, a point on it, vertex and normal, at zero joint angles; ENU, m.
 
     Raises
     ------
@@ -118,11 +123,11 @@ class Pointing:
     def turned(
         self, turn: tuple[float, float, float, float], u: tuple[float, float, float]
     ) -> tuple[float, float, float]:
-        """Return the mirror's vector ``u`` after a turn (sin θ₁, cos θ₁, sin θ₂, cos θ₂)."""
+        """Return the mirror's vector ``u`` after a turn, (sin θ₁, cos θ₁, sin θ₂, cos θ₂)."""
         return about(self.axis_1, turn[0], turn[1], about(self.axis_2, turn[2], turn[3], u))
 
     def vertex(self, turn: tuple[float, float, float, float]) -> tuple[float, float, float]:
-        """Return the vertex relative to the primary origin, m, at a turn."""
+        """Return the vertex at a turn, relative to the primary origin, m."""
         arm = add(self.elbow, about(self.axis_2, turn[2], turn[3], self.arm))
         return about(self.axis_1, turn[0], turn[1], arm)
 
@@ -135,18 +140,18 @@ class Pointing:
     ) -> Pose:
         """Return the pose that sends light from the sun to the aim.
 
-        It is the branch within the stops that moves least. If neither branch reaches the aim, it is
-        the nearest pose, with status and residual set accordingly. The next call overwrites the
-        pose.
+        The pose is on the branch within the stops that needs the smaller motion. If neither branch
+        reaches the aim, the nearest pose is returned, with status and residual set accordingly. The
+        next call overwrites the pose.
 
         Parameters
         ----------
         sun
             Vector to the sun, ENU, of length near 1.
         aim
-            ENU, m.
+            Aim point, ENU, m.
         stops
-            [[low, high] of θ₁, the same of θ₂], rad; may be infinite.
+            Limits [[low, high] of θ₁, [low, high] of θ₂], rad; may be infinite.
         near
             Present joint angles, rad.
         """
@@ -181,7 +186,10 @@ class Pointing:
         stops: list[list[float]],
         near: list[float],
     ) -> None:
-        """Solve one branch into ``pose``; beyond the stops it becomes STOPPED, without angles."""
+        """Solve one branch into ``pose``.
+
+        A pose beyond the stops gets the status STOPPED, and no angles.
+        """
         s, p = unit(sun), minus(aim, self.origin)
         turn = self._fixed_point(pose, s, p)
         if pose.status == DEGENERATE:
@@ -203,7 +211,7 @@ class Pointing:
         stops: list[list[float]],
         near: list[float],
     ) -> None:
-        """Find the nearest pose on the border of the stops' rectangle."""
+        """Find the nearest pose on the border of the range between the stops."""
         s, p = unit(sun), minus(aim, self.origin)
         for axis in (0, 1):
             for held in stops[axis]:
@@ -216,7 +224,11 @@ class Pointing:
         p: tuple[float, float, float],
         m: tuple[float, float, float],
     ) -> tuple[tuple[float, float, float], tuple[float, float, float], float]:
-        """(bisector of s and the path from m to p, that path, its length); length 0 if none."""
+        """Return the wanted normal, the direction from m to p, and the distance.
+
+        The wanted normal is the bisector of s and that direction. The distance is 0 if there is no
+        bisector.
+        """
         path = minus(p, m)
         distance = norm(path)
         if not distance > DEGENERATE_LIMIT:
@@ -231,7 +243,10 @@ class Pointing:
     def _direction(
         self, v: tuple[float, float, float], sign: float
     ) -> tuple[bool, tuple[float, float, float, float]]:
-        """Turn the normal to v: (whether it got there, turn); in the dead cone the nearest."""
+        """Return whether a turn brings the normal to v, and that turn.
+
+        In the dead cone, it is the turn that comes nearest.
+        """
         va = dot(v, self.axis_1)
         v_flat = across(v, self.axis_1)
         height = (self.ub - va * self.ab) * math.sqrt(self.inverse)
@@ -262,7 +277,7 @@ class Pointing:
     def _fixed_point(
         self, pose: Pose, s: tuple[float, float, float], p: tuple[float, float, float]
     ) -> tuple[float, float, float, float]:
-        """Solve without stops; sets the pose's status and returns the turn."""
+        """Solve without stops; set the pose's status and return the turn."""
         turn = (0.0, self.one, 0.0, self.one)
         m = self.vertex(turn)
         before = math.inf
@@ -293,7 +308,7 @@ class Pointing:
         p: tuple[float, float, float],
         turn: tuple[float, float, float, float],
     ) -> tuple[tuple[float, float, float], tuple[float, float, float], float]:
-        """(normal − bisector, path, distance) at a turn."""
+        """Return normal − bisector, direction to the aim, and distance, at a turn."""
         v, path, distance = self._wanted(s, p, self.vertex(turn))
         return minus(self.turned(turn, self.normal), v), path, distance
 
@@ -316,7 +331,7 @@ class Pointing:
         p: tuple[float, float, float],
         turn: tuple[float, float, float, float],
     ) -> bool:
-        """Return whether the beam at a turn passes the aim within tolerance and rounding."""
+        """Return whether the beam at a turn hits the aim to within tolerance and rounding."""
         gap, _, distance = self._gap(s, p, turn)
         # A normal that is off by x deflects the beam by 2x.
         limit = self.tolerance + 16.0 * self.eps * distance
@@ -329,7 +344,10 @@ class Pointing:
         turn: tuple[float, float, float, float],
         axis: int,
     ) -> tuple[float, float, float]:
-        """d(normal − bisector) by a joint angle: the screw formula."""
+        """Return the derivative of normal − bisector with respect to a joint angle.
+
+        This is the screw formula.
+        """
         m, n = self.vertex(turn), self.turned(turn, self.normal)
         w, arm = self.axis_1, m
         if axis == 1:
@@ -347,7 +365,7 @@ class Pointing:
         p: tuple[float, float, float],
         turn: tuple[float, float, float, float],
     ) -> tuple[float, float, float, float]:
-        """Levenberg-damped Gauss-Newton on |normal − bisector|² from a turn."""
+        """Minimise |normal − bisector|² from a turn, with Levenberg-damped Gauss-Newton."""
         damping = 16.0 * self.eps
         gap, _, distance = self._gap(s, p, turn)
         cost = dot(gap, gap) if distance > 0.0 else math.inf
@@ -392,7 +410,7 @@ class Pointing:
         stops: list[list[float]],
         near: list[float],
     ) -> None:
-        """Nearest pose with joint ``axis`` held at a stop; kept if better than the pose's."""
+        """Find the nearest pose with joint ``axis`` held at a stop; keep it if it is better."""
         other = 1 - axis
         low, high = stops[other]
         free = min(max(near[other], low), high)
@@ -418,14 +436,14 @@ class Pointing:
 
 
 def turn_of(one: float, two: float) -> tuple[float, float, float, float]:
-    """(sin θ₁, cos θ₁, sin θ₂, cos θ₂)."""
+    """Return the turn (sin θ₁, cos θ₁, sin θ₂, cos θ₂) of two joint angles."""
     return math.sin(one), math.cos(one), math.sin(two), math.cos(two)
 
 
 def _advanced(
     turn: tuple[float, float, float, float], one: float, two: float
 ) -> tuple[float, float, float, float]:
-    """Return the turn advanced by two small angles, without computing the large ones."""
+    """Return the turn advanced by two small angles, without computing the large angles."""
     s1, c1, s2, c2 = turn_of(one, two)
     return (
         turn[0] * c1 + turn[1] * s1,

@@ -1,17 +1,17 @@
-"""Search: a spiral of beam offsets, until a camera sees the beam on the target."""
+"""Search: a spiral of beam offsets, followed until a camera sees the beam on the target."""
 
 import math
 
 
 class Spiral:
-    """Points of an Archimedean spiral, spaced along it as far apart as its turns.
+    """Points of an Archimedean spiral; neighbouring points are as far apart as its turns.
 
     Parameters
     ----------
     pitch
         Distance between neighbouring points and turns, rad of the beam.
     radius
-        Largest offset, rad; the spiral ends there.
+        Largest offset, rad, at which the spiral ends.
 
     Raises
     ------
@@ -32,7 +32,7 @@ class Spiral:
         self.over = False
 
     def advance(self) -> bool:
-        """Advance to the next point, in ``offset`` (right, up); return False at the end."""
+        """Advance to the next point, in ``offset`` (right, up), rad; return False at the end."""
         if self.over:
             return False
         per_radian = self.pitch / (2.0 * math.pi)
@@ -57,7 +57,7 @@ def displaced(
     right: float,
     up: float,
 ) -> tuple[float, float, float]:
-    """Return the aim moved right and up by angles (rad) as seen from the vertex."""
+    """Return the aim moved right and up by angles (rad), as seen from the vertex."""
     east, north, high = aim[0] - vertex[0], aim[1] - vertex[1], aim[2] - vertex[2]
     flat = math.sqrt(east * east + north * north)
     slant = math.sqrt(flat * flat + high * high)

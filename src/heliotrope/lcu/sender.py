@@ -1,4 +1,4 @@
-"""The sender's side of the bus protocol: numbers, frames, signatures. Boards do not contain it."""
+"""The sender's side of the bus protocol: numbers, frames and signatures; not on boards."""
 
 import struct
 
@@ -20,17 +20,17 @@ class Sender:
     address
         Address of the sender.
     epoch
-        Greater than at any earlier start: the GPS second of the start.
+        Epoch, which must be greater than at any earlier start, such as the GPS second of the start.
     sha256
-        The hash, for messages of class KEY.
+        The hash function, for messages of class KEY.
 
     Attributes
     ----------
     epoch, count
         Epoch and count of the last frame created.
     sign
-        Function that returns the tag of bytes under the bus key (`signing.tag`); None: nothing is
-        signed.
+        Function that returns the tag of bytes under the bus key (`signing.tag`); None if no frame
+        is signed.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Sender:
         self._sha256 = sha256
 
     def frame(self, to: int, name: str, *values: "Any", key: bytes = b"") -> bytes:
-        """Return the next frame's bytes; ``key`` is the receiver's, for class KEY.
+        """Return the next frame's bytes; class KEY needs ``key``, the receiver's key.
 
         Raises
         ------
@@ -56,14 +56,14 @@ class Sender:
         return self._make(to, name, wire.pack(name, *values), key, self.sign)
 
     def session(self, token: int) -> bytes:
-        """Return a SESSION for all, to be sent once a second; ``token`` 0: no authority.
+        """Return a SESSION for all, to be sent once a second; with ``token`` 0, no authority.
 
-        Within the last 65536 numbers of an epoch, the next epoch begins.
+        The next epoch begins when at most 65536 numbers of the present epoch are left.
         """
         return self._session(wire.BROADCAST, token, self.sign)
 
     def session_to(self, address: int, token: int, number: bytes, sign: "Sign") -> bytes:
-        """Return a SESSION for one address, signed over the number that the receiver drew."""
+        """Return a SESSION for one address, signed over the random number of the receiver."""
         return self._session(address, token, sign, number)
 
     def _session(self, to: int, token: int, sign: "Sign | None", number: bytes = b"") -> bytes:

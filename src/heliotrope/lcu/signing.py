@@ -1,24 +1,24 @@
-"""Signed frames of a bus: the keys of a local controller, and what makes an old frame worthless.
+"""Signed frames of a bus: the keys of a local controller, and protection against old frames.
 
-A bus may have a key that its cluster and its local controllers share. A signed frame is one of
-version 3: its last 8 bytes before the CRC are a tag, HMAC-SHA256 over a freshness value, header and
-payload, truncated. The freshness value is not on the wire, because both ends know it:
+A bus may have a key that its cluster and its local controllers share. A signed frame has version 3:
+its last 8 bytes before the CRC are a tag, a truncated HMAC-SHA256 over a freshness value, header
+and payload. The freshness value is not transmitted, because both ends know it:
 
-- of SESSION to one address: the number that the receiver drew (BUS tells it), good for one use;
-- of SESSION to all: epoch and count of its own payload and header;
+- of SESSION to one address: the number that the receiver drew (sent in BUS), valid for one use;
+- of SESSION to all: the epoch in its payload, and the count in its payload and header;
 - of every other frame: the epoch of the last SESSION, and the 32-bit count of the frame, which the
   receiver completes from the 16 bits of its sequence.
 
-So a recorded frame is refused: its count has passed. After a start a receiver holds neither epoch
-nor count, and a recorded SESSION would bring old ones back. It therefore takes its first SESSION
-only with a tag over its own number, which nobody can have recorded. That number is itself a tag,
-over the serial number, the count of boots and a count of the numbers drawn: it never comes twice,
-and nobody without the key can predict it, so no board needs a source of chance.
+A recorded frame is therefore refused, because its count has passed. After a start, a receiver knows
+neither epoch nor count, and a recorded SESSION could set old values. The receiver therefore accepts
+its first SESSION only with a tag over its own number, which nobody can have recorded. That number
+is itself a tag, over the serial number, the boot count and a count of the numbers drawn. It never
+repeats, and nobody without the key can predict it, so no board needs a source of random numbers.
 
-Inputs of HMAC under one key differ in length or begin: a frame has 16 bytes or more, a number is
-drawn from 8, a fingerprint is made of 2.
+The HMAC inputs for different purposes under one key differ in length: a frame has 16 bytes or more,
+a number is drawn from 8 bytes, and a fingerprint is made from 2.
 
-A board imports this module only when it has a key, or is given one.
+A board imports this module only when it has a key or receives one.
 """
 
 import struct
@@ -38,43 +38,47 @@ NO_KEY = bytes(KEY_SIZE)
 
 
 def pads_of(key: bytes) -> "Pads":
-    """Return the two padded HMAC keys, which are kept because that saves half of the time here."""
+    """Return the two padded HMAC keys.
+
+    They are kept because that halves the computing time here.
+    """
     key += bytes(64 - len(key))
     return bytes([byte ^ 0x36 for byte in key]), bytes([byte ^ 0x5C for byte in key])
 
 
 def tag(sha256: "Hash", pads: "Pads", data: bytes) -> bytes:
-    """Return HMAC-SHA256, its first 8 bytes."""
+    """Return the first 8 bytes of HMAC-SHA256."""
     return sha256(pads[1] + sha256(pads[0] + data))[: wire.MAC_SIZE]
 
 
 def counted(epoch: int, count: int) -> bytes:
-    """Return the freshness value of a frame, from its position among its sender's frames."""
+    """Return the freshness value of a frame, from its epoch and count."""
     return struct.pack("<II", epoch, count & 0xFFFFFFFF)
 
 
 def fingerprint(sha256: "Hash", pads: "Pads") -> int:
-    """Return a number that identifies a key and reveals nothing about it; 0 means none."""
+    """Return a number that identifies a key but reveals nothing about it; 0 means no key."""
     return int(struct.unpack("<I", tag(sha256, pads, b"id")[:4])[0]) or 1
 
 
 def wrapped(sha256: "Hash", own_key: bytes, edition: int, key: bytes) -> bytes:
-    """Return the bus key in the form that SET_BUS_KEY carries, or undo that.
+    """Return the bus key as encrypted in SET_BUS_KEY, or decrypt it.
 
-    It is combined by XOR with HMAC-SHA256 of the edition under the key of the one local controller.
-    An edition is used once, so this is a one-time pad; the MAC of the message protects it.
+    The key is combined by XOR with the HMAC-SHA256 of the edition under the local controller's key.
+    An edition is used only once, so this is a one-time pad; the MAC of the message protects it from
+    changes.
     """
     pad = wire.hmac_sha256(sha256, own_key, struct.pack("<I", edition))
     return bytes([key[place] ^ pad[place] for place in range(KEY_SIZE)])
 
 
 class BusKeys:
-    """The bus keys of a local controller: the newest, and an old one during a key change.
+    """The bus keys of a local controller: the newest key, and the old key during a key change.
 
     Parameters
     ----------
     sha256
-        The hash.
+        The hash function.
     own_key
         Key of the local controller, under which bus keys are sent to it.
     serial, boots
@@ -83,9 +87,9 @@ class BusKeys:
     Attributes
     ----------
     stored
-        Both keys, the newest first, zeros for none.
+        Both keys, newest first; zeros stand for no key.
     nonce
-        The number over which the next SESSION to this address must be signed.
+        The random number over which the next SESSION to this address must be signed.
     """
 
     def __init__(self, sha256: "Hash", own_key: bytes, serial: int, boots: int) -> None:
@@ -107,8 +111,8 @@ class BusKeys:
     def with_key(self, payload: bytes) -> bytes:
         """Return the record to store after a SET_BUS_KEY.
 
-        A new key goes before the present one, the present key sent again ends the old one, and
-        zeros end both.
+        A new key is placed before the present key. Sending the present key again removes the old
+        key, and zeros remove both keys.
         """
         edition = struct.unpack("<I", payload[8:12])[0]
         key = wrapped(self._sha256, self._own_key, edition, payload[12:])
@@ -117,11 +121,11 @@ class BusKeys:
 
     @property
     def keyed(self) -> bool:
-        """Whether there is a key."""
+        """Return whether there is a key."""
         return len(self._pads) > 0
 
     def told(self) -> "tuple[int, ...]":
-        """Return the numbers of BUS: the number drawn, in two halves, and both fingerprints."""
+        """Return the numbers of BUS: the random number, in two halves, and both fingerprints."""
         prints = [fingerprint(self._sha256, pads) for pads in self._pads] + [0, 0]
         high, low = struct.unpack("<II", self.nonce or bytes(8))
         return high, low, prints[0], prints[1]

@@ -1,9 +1,9 @@
-"""States of a local controller, and all its transitions as one table.
+"""States of a local controller, and all its transitions in one table.
 
-A line: state, event, new state, motion that starts (if any). An event that is not in the table is
-refused and changes nothing. A motion that starts replaces any other motion. ``names`` describes the
-events and motions. The table is text, because on a microcontroller a tuple per line would take 7 kB
-more.
+A line contains the state, the event, the new state and the motion that starts, if any. An event
+that is not in the table is refused and changes nothing. A motion that starts replaces any other
+motion. ``names`` describes the events and motions. The table is text, because on a microcontroller
+a tuple per line would take 7 kB more.
 """
 
 STATES = (
@@ -144,7 +144,7 @@ FAULT FAULTED FAULT
 
 
 def transition(state: int, event: str) -> "tuple[int, str] | None":
-    """Return (new state, motion or ""), or None if the event is refused."""
+    """Return the new state and the motion ("" if none starts); None if the event is refused."""
     key = "\n" + STATES[state] + " " + event + " "
     start = TABLE.find(key)
     if start < 0:

@@ -1,14 +1,14 @@
 """Steps: converts the goals of two axes to segments for a hardware timer.
 
-Time runs in slots of some tens of milliseconds. In each, an axis makes the steps of its
-present speed, which changes by no more than the acceleration allows and never exceeds the speed
-from which it can still stop before the goal. Everything is in integers; speeds and phases are in
-steps per slot times ``SCALE``. A segment is (axis, direction, count, interval in µs): the
-hardware makes ``count`` pulses, waiting the interval after each. It plays the segments of an
-axis one after the other; no Python runs per step.
+Time runs in slots of some tens of milliseconds. In each slot, an axis makes steps at its present
+speed, which changes by no more than the acceleration allows and never exceeds the speed from which
+the axis can still stop before the goal. All numbers are integers; speeds and phases are in steps
+per slot times ``SCALE``. A segment is (axis, direction, count, interval in µs): the hardware makes
+``count`` pulses and waits for the interval after each pulse. It executes the segments of an axis
+one after another; no Python code runs per step.
 
-Counts refer to segments emitted. An emitted segment is executed, except at an emergency stop: then
-the hardware reports how many steps it did not make, and `Stepper.undone` subtracts them.
+Counts refer to emitted segments. An emitted segment is executed, except at an emergency stop. The
+hardware then reports how many steps it did not make, and `Stepper.undone` subtracts them.
 """
 
 SCALE = 1024
@@ -34,13 +34,13 @@ def root(square: int) -> int:
 
 
 def stopping(speed: int, change: int) -> int:
-    """Return the distance of a slot at ``speed`` plus the slots of slowing down after it."""
+    """Return the steps made in one slot at ``speed`` and while slowing down afterwards."""
     m = speed // change
     return (m + 1) * speed - change * m * (m + 1) // 2
 
 
 def fastest(distance: int, change: int) -> int:
-    """Return the greatest speed whose `stopping` distance is at most ``distance``."""
+    """Return the highest speed whose `stopping` distance is at most ``distance``."""
     m = (root(8 * distance // change + 1) - 1) >> 1
     while change * m * (m + 1) // 2 > distance:
         m -= 1
@@ -55,14 +55,14 @@ class Axis:
     Parameters
     ----------
     low, high
-        Range of the counts, steps. No goal beyond it is accepted.
+        Range of the counts, steps; goals beyond the range are not accepted.
     rate, acceleration
-        steps/s, steps/s².
+        Maximum rate, steps/s, and acceleration, steps/s².
     backlash
         Steps past a goal that is approached from above, so that the goal is always reached from
         below.
     slot_ms
-        Length of a slot.
+        Length of a slot, ms.
 
     Raises
     ------
@@ -94,11 +94,11 @@ class Axis:
         self.braking = False
 
     def still(self) -> bool:
-        """Whether the axis is at its goal."""
+        """Return whether the axis is at rest at its goal."""
         return self.speed == 0 and self.count == self.leg == self.goal
 
     def aim(self, goal: int) -> bool:
-        """Set a goal to be reached from below; return False if it was cut to the range."""
+        """Set a goal to be reached from below; return False if the goal was cut to the range."""
         cut = min(max(goal, self.low), self.high)
         self.goal = self.leg = cut
         self.braking = self.led = False
@@ -124,7 +124,10 @@ class Axis:
         self.braking = False
 
     def slot(self, held: bool) -> int:
-        """Advance by one slot, or slow down if held; return its steps, signed by ``direction``."""
+        """Advance by one slot, or slow down if held; return the number of steps made.
+
+        ``direction`` is the sign of the steps.
+        """
         if self.speed == 0:
             self.phase = 0
             if self.count == self.leg:
@@ -148,7 +151,7 @@ class Axis:
         return steps
 
     def interval_us(self, steps: int) -> int:
-        """Return the time between the steps of the last slot, rounded up."""
+        """Return the time between the steps of the last slot, µs, rounded up."""
         return max(self.shortest_us, self.slot_us // steps)
 
 
@@ -158,10 +161,10 @@ class Stepper:
     Parameters
     ----------
     axes
-        Primary and secondary.
+        Primary and secondary axis.
     slot_ms, ahead_ms
-        Length of a slot, and how far ahead of the hardware segments are emitted: more than the
-        longest pause of the main loop.
+        Length of a slot, ms; time by which segments are emitted ahead of the hardware, ms, which
+        must exceed the longest pause of the main loop.
     """
 
     def __init__(self, axes: list[Axis], slot_ms: int, ahead_ms: int) -> None:
@@ -174,13 +177,16 @@ class Stepper:
         self.queued_ms = 0
 
     def go(self, primary: int, secondary: int, order: int) -> bool:
-        """Go to step counts, one axis after the other or both; return False if one was cut."""
+        """Go to step counts, one axis at a time or both together.
+
+        Return False if a goal was cut to its range.
+        """
         self.order = order
         first = self.axes[0].aim(primary)
         return self.axes[1].aim(secondary) and first
 
     def follow(self, primary: int, secondary: int) -> bool:
-        """Follow goals that move slowly, without passing them by the backlash every time.
+        """Follow slowly moving goals without overshooting each goal by the backlash.
 
         An axis that must go down is set ahead by an eighth of its backlash and waits until the goal
         has moved by as much. In rough stepping an axis goes to the nearest full step; if the full
@@ -205,12 +211,15 @@ class Stepper:
         return inside
 
     def stop(self) -> None:
-        """Stop both axes within their acceleration."""
+        """Slow both axes down within their acceleration and stop."""
         for axis in self.axes:
             axis.brake()
 
     def undone(self, primary: int, secondary: int) -> None:
-        """After an emergency stop, subtract signed steps emitted but not made; both axes stand."""
+        """Subtract signed steps that were emitted but not made, after an emergency stop.
+
+        Both axes are then at rest.
+        """
         for axis, steps in zip(self.axes, (primary, secondary)):  # noqa: B905
             axis.count -= steps
             axis.speed = axis.phase = 0
@@ -218,11 +227,11 @@ class Stepper:
         self.queued_ms = 0
 
     def still(self) -> bool:
-        """Whether both axes are at their goals and the hardware has sent all steps."""
+        """Return whether both axes are at their goals and the hardware has sent all steps."""
         return self.queued_ms <= 0 and self.axes[0].still() and self.axes[1].still()
 
     def advance(self, elapsed_ms: int, out: list[tuple[int, ...]], kind: int) -> None:
-        """Emit segments for ``elapsed_ms``: (kind, axis, direction, count, µs)."""
+        """Emit segments for ``elapsed_ms``, each (kind, axis, direction, count, µs)."""
         self.queued_ms -= elapsed_ms
         if self.queued_ms < 0:
             for axis in self.axes:

@@ -1,33 +1,34 @@
-"""Frames of the wire, version 2: bytes in, frames out, and a gate for those that may act.
+"""Frames of the bus protocol, version 2, and a gate that decides which frames may act.
 
 A frame, before byte stuffing (numbers little-endian)::
 
     version  to  from  sequence  type  payload  [MAC]  CRC-32
        1      2    2       2       1   0..236     8       4      bytes
 
-COBS removes every zero from it, and a zero ends it. ``from`` 0 is the cluster controller, ``to``
-0xFFFF is all. Only messages of class KEY have a MAC. The CRC covers all bytes before it.
-A receiver that starts in the middle of a frame, or hears noise, is in step again at the next zero;
-a sender may begin with a zero to end any noise before.
+COBS removes every zero from the frame, and a zero ends it. ``from`` 0 is the cluster controller,
+``to`` 0xFFFF addresses all. Only messages of class KEY have a MAC. The CRC covers all bytes before
+it. A receiver that starts in the middle of a frame, or receives noise, is in step again at the next
+zero; a sender may begin with a zero to end any preceding noise.
 
-**Old frames.** Sequence numbers alone cannot distinguish a restart of their sender, or a
-link that came back after an hour, from a replay. So the sender keeps a 32-bit count of its
-frames; the lower 16 bits are the sequence, and once a second it broadcasts SESSION with the
-upper ones, its epoch and the token of the one authority. The epoch rises with every start of
-the sender (the GPS second of the start serves, and needs no memory) and whenever the count is
-used up. A receiver accepts a SESSION whose (epoch, count) is greater than the one it holds, and
-between SESSIONs each frame whose sequence is 1 to 32767 after the last one accepted. After a
+**Old frames.** Sequence numbers alone cannot distinguish a sender's restart, or a link that comes
+back after an hour, from a replay. The sender therefore keeps a 32-bit count of its frames. The
+lower 16 bits are the sequence, and once a second the sender broadcasts SESSION with the upper 16
+bits, its epoch and the token of the one authority. The epoch increases with every start of the
+sender (the GPS second of the start is suitable, and needs no memory) and whenever the count is used
+up. A receiver accepts a SESSION whose (epoch, count) is greater than the last accepted pair, and
+between SESSIONs each frame whose sequence is 1 to 32767 after the last accepted one. After a
 restart of the receiver, or 10 s of silence (in which the bus carries far fewer than 32768 frames),
-it accepts a SESSION first and nothing else. Frames from before a sender's restart that are still
-under way fail by their token, which changes with the epoch. A sender whose commands are answered
-"duplicate" for any other reason starts a new epoch.
+it accepts nothing but a SESSION at first. Frames from before a sender's restart that are still in
+transit are refused because of their token, which changes with the epoch. A sender whose commands
+are answered "duplicate" for any other reason starts a new epoch.
 
-Messages that act have two further locks: they expire by the clock, within a time in which the
-sequence cannot come round, and those that change stored settings carry a MAC and an edition that
-only rises. DEFOCUS and STOW have no lock at all; questions change nothing. This prevents accidents.
-Against a person at the bus only the MAC protects, and so only the stored settings.
+Messages that act have two further safeguards: they expire by the clock, within a time in which the
+sequence cannot wrap, and messages that change stored settings carry a MAC and an edition that only
+increases. DEFOCUS and STOW have no such safeguard, and queries change nothing. This prevents
+accidents. Against an intruder on the bus only the MAC protects, and it covers only the stored
+settings.
 
-The hash is injected: ``sha256(data) -> 32 bytes``.
+The hash function is injected: ``sha256(data) -> 32 bytes``.
 """
 
 import math
@@ -46,7 +47,7 @@ if TYPE_CHECKING:  # for the type checker only; a microcontroller has neither mo
 
         @property
         def keyed(self) -> bool:
-            """Whether there is a key."""
+            """Return whether there is a key."""
 
         def judge(self, frame: "Frame", values: "tuple[Any, ...]", replay: "Replay") -> int:
             """Return DONE if a frame is signed as required."""
@@ -67,7 +68,7 @@ HEADER_SIZE = 8
 CRC_SIZE = 4
 PAYLOAD_LIMIT = FRAME_LIMIT - 2 - HEADER_SIZE - CRC_SIZE
 
-#: Longest life of a command, s. On the fastest bus, fewer than half of the sequence numbers are
+#: Longest lifetime of a command, s. On the fastest bus, fewer than half of the sequence numbers are
 #: used in this time, so an earlier command is either old by its number or expired.
 HORIZON_S = 30
 #: After this much silence from a sender, its next frame must be a SESSION, ms.
@@ -86,7 +87,7 @@ LARGEST_DOUBLE = 1.7976931348623157e308
 
 
 def stuff(data: bytes) -> bytes:
-    """Return ``data`` without zeros (consistent overhead byte stuffing), without a terminator."""
+    """Return ``data`` without zeros (consistent overhead byte stuffing) and without terminator."""
     out = bytearray()
     start = 0
     while True:
@@ -108,7 +109,7 @@ def stuff(data: bytes) -> bytes:
 
 
 def unstuff(data: bytes) -> "bytes | None":
-    """Undo ``stuff``; None if ``data`` cannot be its result."""
+    """Undo ``stuff``; return None if ``data`` cannot be its result."""
     out = bytearray()
     start = 0
     size = len(data)
@@ -125,7 +126,7 @@ def unstuff(data: bytes) -> "bytes | None":
 
 
 def _single(codes: str) -> str:
-    """Expand counts: "B3d" -> "Bddd"."""
+    """Expand counts in codes, such as "B3d" to "Bddd"."""
     out = ""
     count = ""
     for code in codes:
@@ -138,7 +139,7 @@ def _single(codes: str) -> str:
 
 
 def _refusal(code: str, value: "Any") -> str:
-    """Return the reason why a value does not fit a code, or ""."""
+    """Return the reason why a value does not fit a code; "" if it fits."""
     if code == "s":
         return "" if isinstance(value, (bytes, bytearray)) else f"{value!r} is not bytes"
     if code in RANGES:
@@ -153,20 +154,21 @@ def _refusal(code: str, value: "Any") -> str:
 
 
 def pack(name: str, *values: "Any") -> bytes:
-    """Return a message's payload, head included.
+    """Return the payload of a message, including its head.
 
     Parameters
     ----------
     name
         Name of the message, as in the table.
     *values
-        All its numbers in order, those of fields with several numbers one by one.
+        All numbers of the message in order; fields with several numbers contribute one value per
+        number.
 
     Raises
     ------
     ValueError
-        If the name is unknown, the number of values is wrong, or a code cannot hold its value.
-        (``struct`` of MicroPython would truncate it silently.)
+        If the name is unknown, the number of values is wrong, or a value does not fit its code.
+        (MicroPython's ``struct`` would truncate the value silently.)
     """
     number = messages.NUMBER_OF.get(name)
     if number is None:
@@ -185,7 +187,7 @@ def pack(name: str, *values: "Any") -> bytes:
 
 
 def fits(number: int, size: int) -> bool:
-    """Return whether a payload of ``size`` bytes can be that of a known message."""
+    """Return whether a known message can have a payload of ``size`` bytes."""
     return _fits(messages.codes_of(number), size)
 
 
@@ -201,13 +203,14 @@ def finite(values: "tuple[Any, ...]") -> bool:
 
 
 def unpack(number: int, payload: bytes) -> "tuple[Any, ...] | None":
-    """Read a message's payload, head included.
+    """Read the payload of a message, including its head.
 
     Returns
     -------
     tuple or None
-        The numbers as ``pack`` takes them; None if the message is unknown, the length is wrong,
-        or a number is not finite (no sender means that, and it would pass every comparison).
+        The numbers as ``pack`` takes them; None if the message is unknown, the length is wrong, or
+        a number is not finite (no sender intends such a number, and it would pass every
+        comparison).
     """
     if messages.who_of(number) < 0:
         return None
@@ -228,12 +231,12 @@ class Frame:
     Attributes
     ----------
     to, sender, sequence, number
-        As in the header; ``number`` is the type of the message.
+        Values from the header; ``number`` is the type of the message.
     payload
         Bytes with the head, without the MAC. In a known message its length is valid; in an unknown
-        one it is everything before the CRC.
+        message the payload is everything before the CRC.
     mac
-        8 bytes in messages of class KEY and in signed frames, else b"".
+        8 bytes in messages of class KEY and in signed frames, otherwise b"".
     version
         ``VERSION`` or ``SIGNED``.
     """
@@ -259,17 +262,17 @@ class Frame:
 
     @property
     def name(self) -> str:
-        """Name of the message, empty if unknown."""
+        """Return the name of the message; empty if it is unknown."""
         return messages.name_of(self.number)
 
     def values(self) -> "tuple[Any, ...] | None":
-        """Return the payload's numbers; see ``unpack``. They are parsed once."""
+        """Return the payload's numbers, which are parsed only once; see ``unpack``."""
         if self._values is None:
             self._values = unpack(self.number, self.payload)
         return self._values
 
     def body(self) -> bytes:
-        """Return the bytes that the MAC covers: header and payload."""
+        """Return the bytes that the MAC covers, that is, header and payload."""
         return (
             struct.pack(HEADER, self.version, self.to, self.sender, self.sequence, self.number)
             + self.payload
@@ -290,7 +293,7 @@ def hmac_sha256(sha256: "Callable[[bytes], bytes]", key: bytes, data: bytes) -> 
 
 
 def authenticate(sha256: "Callable[[bytes], bytes]", key: bytes, frame: Frame) -> bytes:
-    """Return the MAC of a frame: HMAC-SHA256 over header and payload, its first 8 bytes.
+    """Return the MAC of a frame: the first 8 bytes of HMAC-SHA256 over header and payload.
 
     Raises
     ------
@@ -303,14 +306,14 @@ def authenticate(sha256: "Callable[[bytes], bytes]", key: bytes, frame: Frame) -
 
 
 def verify(sha256: "Callable[[bytes], bytes]", key: bytes, frame: Frame) -> bool:
-    """Return whether a frame carries the MAC of ``key``; never with an empty key."""
+    """Return whether a frame carries the MAC of ``key``; always False with an empty key."""
     return bool(key) and same(authenticate(sha256, key, frame), frame.mac)
 
 
 def same(expected: bytes, mac: bytes) -> bool:
     """Return whether two MACs are equal.
 
-    All bytes are compared whatever the first bytes are, so timing reveals nothing.
+    All bytes are compared, even if the first bytes differ, so that timing reveals nothing.
     """
     if len(mac) != MAC_SIZE:
         return False
@@ -321,13 +324,13 @@ def same(expected: bytes, mac: bytes) -> bool:
 
 
 def encode(frame: Frame) -> bytes:
-    """Return a frame's bytes on the wire, its zero included.
+    """Return a frame's bytes as sent on the bus, including the final zero.
 
     Raises
     ------
     ValueError
         If an address, sequence or type is out of range; if a payload does not fit the message or
-        the frame; if a MAC is missing in a message of class KEY, or present in another message.
+        the frame; if a MAC is missing from a message of class KEY, or present in another message.
     """
     what = frame.name or f"message {frame.number}"
     header = (("to", frame.to), ("from", frame.sender), ("sequence", frame.sequence))
@@ -350,20 +353,20 @@ def encode(frame: Frame) -> bytes:
 
 
 def sealed(frame: Frame) -> bytes:
-    """Return the wire bytes of a frame that is known to be valid."""
+    """Return the bytes, as sent on the bus, of a frame that is known to be valid."""
     data = frame.body() + frame.mac
     return stuff(data + struct.pack("<I", crc32(data))) + b"\0"
 
 
 class Reader:
-    """Bytes in pieces of any size in, complete frames out; at most one frame's bytes are kept.
+    """Accepts bytes in pieces of any size and returns complete frames.
 
     Attributes
     ----------
     good, crc, cobs, length, version
-        Counts: complete frames; wrong checksums; invalid stuffing; frames that are too long, too
+        Numbers of complete frames; wrong checksums; invalid stuffing; frames that are too long, too
         short, or of a length that does not fit their message; frames of another version. A frame
-        that is not counted under ``good`` changes nothing else.
+        that is not counted under ``good`` has no other effect. At most one frame's bytes are kept.
     """
 
     def __init__(self) -> None:
@@ -376,7 +379,7 @@ class Reader:
         self._too_long = False
 
     def feed(self, data: bytes) -> "list[Frame]":
-        """Accept received bytes, and return the frames that they complete."""
+        """Accept received bytes and return the frames that these bytes complete."""
         data = bytes(data)
         frames: list[Frame] = []
         start = 0
@@ -441,14 +444,14 @@ def expired(expires_s: int, now_s: "int | None") -> bool:
     Parameters
     ----------
     expires_s
-        Last GPS second at which it is valid, modulo 2^32.
+        Last GPS second at which the command is valid, modulo 2^32.
     now_s
         The present GPS second, modulo 2^32; None if unknown, in which case every command is void.
 
     Notes
     -----
-    A command valid for more than ``HORIZON_S`` is void too, because 32-bit numbers that wrap cannot
-    distinguish long ago from far ahead.
+    A command valid for more than ``HORIZON_S`` is also void, because 32-bit numbers that wrap
+    cannot distinguish the distant past from the distant future.
     """
     return now_s is None or ((expires_s - now_s) & 0xFFFFFFFF) > HORIZON_S
 
@@ -459,7 +462,7 @@ class Replay:
     Attributes
     ----------
     epoch, count
-        Of the last frame accepted; ``epoch`` is -1 before the first SESSION.
+        Epoch and count of the last accepted frame; ``epoch`` is -1 before the first SESSION.
     """
 
     def __init__(self) -> None:
@@ -468,16 +471,16 @@ class Replay:
         self._heard = ticks.Deadline()
 
     def session(self, epoch: int, rollover: int, sequence: int, tick: int) -> bool:
-        """Accept a SESSION, and return whether it is new.
+        """Accept a SESSION and return whether it is new.
 
         Parameters
         ----------
         epoch, rollover
-            From its payload.
+            Values from the payload.
         sequence
-            From its header.
+            Sequence from the header.
         tick
-            When it arrived, in ms; see ``ticks``.
+            Time of arrival, ms; see ``ticks``.
         """
         count = (rollover << 16) | sequence
         if self.epoch >= 0:
@@ -490,7 +493,7 @@ class Replay:
         return True
 
     def look(self, tick: int) -> bool:
-        """Return whether the sender was heard recently; see ``ticks.Deadline`` on how often."""
+        """Return whether the sender was heard recently; for how often to call, see ``Deadline``."""
         return not self._heard.over(tick)
 
     def silent(self) -> bool:
@@ -498,7 +501,7 @@ class Replay:
         return self._heard.left == 0
 
     def fresh(self, sequence: int, tick: int) -> bool:
-        """Return whether any other frame is new, and if so, record it."""
+        """Return whether a frame other than SESSION is new, and if so, record it."""
         if not self.look(tick):
             return False
         ahead = (sequence - self.count) & 0xFFFF
@@ -510,14 +513,14 @@ class Replay:
 
 
 class Gate:
-    """Decides whether a frame may act: invariants 4 and 5 in one place.
+    """Decides whether a frame may act; ensures invariants 4 and 5.
 
     Parameters
     ----------
     sha256
-        The hash, or None if nothing may be stored.
+        The hash function; None if nothing may be stored.
     key
-        Key of this local controller; b"": nothing can be stored.
+        Key of this local controller; with b"", nothing can be stored.
     edition
         Edition of the last stored message, from the journal.
     sender
@@ -526,9 +529,9 @@ class Gate:
     Attributes
     ----------
     bus
-        Bus keys; None: there are none, and no frame needs to be signed.
+        Bus keys; None if there are none, in which case no frame needs to be signed.
     token
-        Token of the authority, 0 if nobody holds it.
+        Token of the command authority; 0 if nobody holds it.
     edition
         Edition of the last stored message; the caller stores it together with the message's items.
     """
@@ -549,16 +552,16 @@ class Gate:
         self._sender = sender
 
     def judge(self, frame: Frame, tick: int, now_s: "int | None") -> int:
-        """Return DONE if the frame may act, else the result that says why not.
+        """Return DONE if the frame may act, otherwise the reason for its refusal.
 
         Parameters
         ----------
         frame
             A frame meant for this address.
         tick
-            When it arrived, in ms.
+            Time of arrival, ms.
         now_s
-            The present GPS second, or None if unknown.
+            The present GPS second; None if it is unknown.
         """
         who = messages.who_of(frame.number)
         self.replay.look(tick)
@@ -599,11 +602,11 @@ class Gate:
         return self.bus is not None and self.bus.keyed
 
     def waits(self) -> bool:
-        """Return whether a SESSION signed over a number drawn here is needed."""
+        """Return whether a SESSION signed over a random number drawn here is needed."""
         return self.keyed() and (self.replay.epoch < 0 or self.replay.silent())
 
     def judge_key(self, frame: Frame, edition: int) -> int:
-        """Return DONE if a frame carries the MAC of this controller's key and a new edition."""
+        """Return DONE if a frame has the MAC of this controller's key and a new edition."""
         if self._sha256 is None or not verify(self._sha256, self._key, frame):
             return messages.REFUSED_KEY
         if edition <= self.edition:

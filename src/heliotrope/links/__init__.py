@@ -1,9 +1,10 @@
-"""Links between the plant and its clusters: a message arrives fresh or not at all.
+"""Links between the plant and its clusters: a message arrives in time or not at all.
 
 `Link` is the protocol of one end of a link; its module ``link`` states the guarantees.
-`CarriedLink` is the only implementation, over a `Carrier`: in the same process (`memory_pair`), TCP
-(`tcp_link`, `TcpServer`) or an MQTT broker (module ``mqtt``, which needs the extra ``control``).
-`Conversation` seals each message in an envelope that bounds its age without a common clock.
+`CarriedLink` is the only implementation. It runs over a `Carrier`: within one process
+(`memory_pair`), over TCP (`tcp_link`, `TcpServer`) or through an MQTT broker (module ``mqtt``,
+which needs the extra ``control``). `Conversation` seals each message in an envelope that bounds its
+age without a common clock.
 
 `encode` and `decode` convert messages (`Lease`, `Command`, `ClusterStatus`, …) to bytes and back. A
 `TappedLink` passes the messages of any link to a listener.

@@ -1,4 +1,4 @@
-"""Strict tables and URLs of links, used in both plant and cluster files.
+"""Strict tables and link URLs, used in both plant and cluster files.
 
 Addresses and limits may be shared and kept under version control; keys may not: see `links.keys`.
 """
@@ -15,23 +15,23 @@ _PORTS = {"tcp": None, "mqtt": 1883, "mqtts": 8883}
 
 
 class Table(BaseModel):
-    """A table of a configuration file, in which unknown keys are refused."""
+    """A table of a configuration file; unknown keys in it are refused."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
-    """Return scheme, host, port and prefix of a link URL.
+    """Return the scheme, host, port and topic prefix of a link URL.
 
     Parameters
     ----------
     path, where
-        File and place of the URL, for the error message.
+        File of the URL, and its location there, for the error message.
 
     Raises
     ------
     FormatError
-        If it is not a link URL, or a part is missing.
+        If the text is not a link URL, or a part is missing.
     """
     try:
         parts = urlsplit(url)
@@ -53,12 +53,12 @@ def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
 
 
 def check_encryption(path: Path, host: str, where: str, accepted: bool) -> None:
-    """Refuse an unencrypted link to another computer, unless that is accepted.
+    """Refuse an unencrypted link to another computer, unless the configuration accepts it.
 
     Parameters
     ----------
     path, where
-        File and place of the address, for the error message.
+        File of the address, and its location there, for the error message.
     host
         Host or address of the other end, or the address listened on.
     accepted

@@ -1,8 +1,8 @@
 """The bus key, in a separate file that its cluster reads (`lcu.signing`).
 
-``keys`` is a list of keys in hexadecimal text: one key; during a key change, the new key and the
-previous one; or empty if frames are no longer to be signed, in which case the cluster removes the
-key from its local controllers.
+``keys`` is a list of keys in hexadecimal text. It contains one key or, during a key change, the new
+key and the previous key. It is empty if frames are no longer to be signed; the cluster then removes
+the key from its local controllers.
 """
 
 import secrets
@@ -54,7 +54,7 @@ def _key(path: Path, value: object) -> bytes:
 
 
 class BusKeyFile:
-    """The bus key file, which may be changed; every change is written completely or not at all.
+    """The bus key file, which can be changed; each change is written completely or not at all.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class BusKeyFile:
         Raises
         ------
         InputError
-            If there is a key already.
+            If there already is a key.
         """
         if self.keys:
             raise InputError(
@@ -93,7 +93,7 @@ class BusKeyFile:
         self._write(secrets.token_bytes(KEY_SIZE))
 
     def rotate(self) -> None:
-        """Create a new key beside the present one.
+        """Create a new key and keep the present key beside it.
 
         Raises
         ------
@@ -124,7 +124,7 @@ class BusKeyFile:
         self._write(self.keys[0])
 
     def off(self) -> None:
-        """Remove all keys; the cluster then removes them from its local controllers too."""
+        """Remove all keys; the cluster then also removes them from its local controllers."""
         self._write()
 
     def _write(self, *keys: bytes) -> None:

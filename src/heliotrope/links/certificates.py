@@ -1,4 +1,4 @@
-"""TLS certificates: issued by a private authority, or requested from another one.
+"""TLS certificates, issued by a private authority or requested from another authority.
 
 A folder contains the authority (``ca.pem``, ``ca.key``) and the files of each server (``NAME.pem``,
 ``NAME.key``). Private keys are never overwritten; a certificate is renewed with its existing key.
@@ -35,7 +35,7 @@ _EARLIER = timedelta(hours=1)
 
 @dataclass(frozen=True)
 class Certified:
-    """Files of a server: its certificate or request, its key, and the authority if it is ours."""
+    """Files of a server: its certificate or request, its key, and our own authority if it signs."""
 
     certificate: Path
     key: Path
@@ -52,13 +52,13 @@ def certify(
     folder
         Folder of the authority, which is created if missing.
     names
-        Host names and addresses, starting with the name for display.
+        Host names and addresses; the first is the name for display.
     now
         Start of the validity.
     days
-        Validity, 1 to `LONGEST`.
+        Validity in days, 1 to `LONGEST`.
     server
-        Name of its files.
+        Name of the server's files.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def request(folder: Path, names: Sequence[str], *, server: str = SERVER) -> Cert
 
 
 def _subject(names: Sequence[str]) -> tuple[x509.Name, x509.SubjectAlternativeName]:
-    """Return the subject, and the names that a client compares with the address it uses."""
+    """Return the subject, and the names that a client compares with the address that it uses."""
     if not names:
         raise InputError(
             "keys tls: specify the name that users type, such as --name plant.example.org"
@@ -140,7 +140,7 @@ def _general(name: str) -> x509.GeneralName:
 
 
 def _authority(folder: Path, now: datetime) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """Return the authority in a folder with its key; both are created if neither exists."""
+    """Return the authority in a folder and its key; create both if neither exists."""
     file = folder / f"{AUTHORITY}.pem"
     if file.exists():
         key = _read(folder / f"{AUTHORITY}.key")
@@ -178,7 +178,7 @@ def _authority(folder: Path, now: datetime) -> tuple[x509.Certificate, ec.Ellipt
 
 
 def _key(folder: Path, name: str) -> tuple[Path, ec.EllipticCurvePrivateKey]:
-    """Return a key in a folder with its path; it is created if missing."""
+    """Return a key in a folder and its path; create the key if it is missing."""
     file = folder / f"{name}.key"
     if file.exists():
         return file, _read(file)

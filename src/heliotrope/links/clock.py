@@ -70,7 +70,7 @@ class SystemClock:
         self._clock = getattr(time, "CLOCK_BOOTTIME", None)
 
     def monotonic(self) -> float:
-        """Return seconds since the computer booted."""
+        """Return the seconds since the computer booted."""
         return time.monotonic() if self._clock is None else time.clock_gettime(self._clock)
 
     def utc(self) -> datetime:
@@ -84,8 +84,8 @@ class VirtualClock:
     Parameters
     ----------
     source
-        Function that returns monotonic seconds, such as `time` of a `VirtualLoop`; None: the clock
-        stops until `advance` is called.
+        Function that returns monotonic seconds, such as `time` of a `VirtualLoop`; if None, time
+        only passes when `advance` is called.
     start
         UTC when the clock is created.
     rate
@@ -131,7 +131,7 @@ class VirtualClock:
         self._by_hand += seconds
 
     def jump(self, seconds: float) -> None:
-        """Set UTC forward (or back) without letting time pass, as an operator may."""
+        """Step UTC forward or back without letting time pass, as an operator may."""
         self._jumped += seconds
 
 
@@ -167,8 +167,8 @@ def gps_seconds(utc: datetime) -> float:
     Parameters
     ----------
     utc
-        Time after 1980, with a time zone. Exact while the leap-second table is valid
-        (`LEAP_SECONDS_VALID_UNTIL`); later the result may be low by a second or more.
+        Time after 1980, with a time zone. The result is exact while the leap-second table is valid
+        (`LEAP_SECONDS_VALID_UNTIL`); later it may be low by a second or more.
     """
     count = leap_seconds(utc)
     return (utc - GPS_EPOCH).total_seconds() + count
@@ -190,7 +190,7 @@ def utc_of_gps(seconds: float) -> datetime:
 
 
 def gps_week(utc: datetime) -> tuple[int, int]:
-    """Return the full GPS week and the time of the week in ms."""
+    """Return the full GPS week and the time of the week, ms."""
     milliseconds = round(gps_seconds(utc) * 1000.0)
     return milliseconds // (WEEK * 1000), milliseconds % (WEEK * 1000)
 
@@ -201,7 +201,8 @@ def utc_of_week(week: int, time_of_week_ms: int, not_before: datetime) -> dateti
     Parameters
     ----------
     week
-        As sent: full, or modulo 1024 (the signal's 10 bits, which roll over every 19.6 years).
+        Week as transmitted: full, or modulo 1024 (the signal's 10 bits, which roll over every 19.6
+        years).
     time_of_week_ms
         0 to 604,799,999.
     not_before
@@ -233,14 +234,14 @@ PROGRAM: ContextVar[str] = ContextVar("PROGRAM", default="")
 
 
 def context_of(program: str) -> Context:
-    """Return a context for the tasks of a simulated program; their own tasks inherit it."""
+    """Return a context for the tasks of a simulated program; tasks that they create inherit it."""
     context = copy_context()
     context.run(PROGRAM.set, program)
     return context
 
 
 class _Drawn(deque[asyncio.Handle]):
-    """Ready callbacks, taken in random order; callbacks of frozen programs wait."""
+    """Ready callbacks, which are taken in random order; callbacks of frozen programs wait."""
 
     def __init__(self, chance: random.Random, nothing: asyncio.Handle) -> None:
         super().__init__()
@@ -307,7 +308,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     Parameters
     ----------
     seed
-        Seed for the order of ready callbacks; None: first in, first out, as in asyncio.
+        Seed for the order of ready callbacks; None for first in, first out, as in asyncio.
     start
         First value of `time`, in s.
 
@@ -336,21 +337,22 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         return self._no_wait.now
 
     def freeze(self, program: str) -> None:
-        """Stop a program, like a stopped process or a suspended computer, until `thaw`.
+        """Stop a program until `thaw`, like a stopped process or a suspended computer.
 
-        None of its code runs, while time continues. Its tasks are those created in `context_of`;
-        the loop needs a seed.
+        None of the program's code runs, while time continues. The program's tasks are the tasks
+        created in `context_of`; the loop needs a seed.
         """
         self._ready.held.setdefault(program, [])
 
     def thaw(self, program: str) -> None:
-        """Continue a program: everything overdue runs at once, in any order."""
+        """Let a frozen program continue: everything overdue then runs at once, in any order."""
         self._ready.extend(self._ready.held.pop(program, ()))
 
     def kill(self, program: str) -> None:
-        """End a frozen program at the point where it stopped; its owner has cancelled its tasks.
+        """End a frozen program at the point where it stopped.
 
-        Pending work is not done: no task takes another step, and no timer wakes a task.
+        The owner must have cancelled the program's tasks. Pending work is not done: no task takes
+        another step, and no timer wakes a task.
         """
         for handle in self._ready.held.get(program, ()):
             # The program's task groups and tasks must still be notified of their end.

@@ -1,6 +1,6 @@
-"""Settings that all clusters of a plant share, and the checksum sent in each status.
+"""Settings that all clusters of a plant share, and their checksum in each status.
 
-The plant computes the same checksum from its own settings, and compares the two.
+The plant computes the checksum of its own settings and compares it with the reported checksum.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ class CommonSettings:
     silence
         Time without a reply after which a heliostat is reported, in s.
     delta_t
-        TT − UT1, in s; None: from the date.
+        TT − UT1, in s; None if it follows from the date.
     limits
         Limits of the safety table that the plant sets; only rows that clusters evaluate count.
     """
@@ -36,17 +36,17 @@ class CommonSettings:
 
 
 def settings_checksum(common: CommonSettings) -> str:
-    """Return the checksum of common settings, eight hexadecimal digits.
+    """Return the checksum of common settings as eight hexadecimal digits.
 
     It is the CRC-32 of ASCII text with a line ``name=value`` for each setting, sorted by name, each
-    line terminated by a newline. A value is the shortest decimal that gives the same binary64
+    line terminated by a newline. A value is the shortest decimal that yields the same binary64
     number ("inf" for never), or "default".
 
     The settings are those of ``[polling]``, ΔT of the site, and the limits of the safety-table rows
     that a cluster evaluates. The checksum does not cover name, heliostats, phase and keys; ports,
     and reply times that depend on the bus; the rest of the site, which each status carries in full;
-    and the longest autonomy, which depends on whether a cluster has an emergency line. If that is
-    less than the plant grants, the cluster reports it (`autonomy_limited`).
+    and the longest autonomy, which depends on whether a cluster has an emergency line. If the
+    longest autonomy is less than the plant grants, the cluster reports this (`autonomy_limited`).
     """
     values: dict[str, float | None] = {
         "delta_t_s": common.delta_t,

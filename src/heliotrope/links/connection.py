@@ -1,4 +1,4 @@
-"""The only link implementation: connects, sends heartbeats, supervises and reconnects."""
+"""The only link implementation: it connects, sends heartbeats, supervises and reconnects."""
 
 import asyncio
 import contextlib
@@ -28,11 +28,14 @@ from heliotrope.links.link import (
 class Carrier(Protocol):
     """A transport for envelopes, which a `CarriedLink` opens and closes repeatedly.
 
-    It raises only `LinkLostError` and OSError (and LinkError while opening).
+    A carrier raises only `LinkLostError` and OSError (and LinkError while opening).
     """
 
     async def open(self) -> SealKeys:
-        """Connect, and return the keys of this connection; cancelled if it takes too long."""
+        """Connect and return the keys of this connection.
+
+        The call is cancelled if it takes too long.
+        """
         ...
 
     async def ready(self) -> None:
@@ -62,13 +65,14 @@ class CarriedLink:
     carrier
         Carrier, used by this link only.
     clock
-        Clock whose monotonic time decides everything, and in which expiries are expressed.
+        Clock whose monotonic time is used for all decisions and for expiries.
     settings
         See `LinkSettings`.
     statistics
-        Counters to use, if the carrier counts too.
+        Counters to use if the carrier counts too.
     seed
-        Seed of the pauses and of the session numbers, for simulation; None: from the system.
+        Seed of the pauses and of the session numbers, for simulation; None to use the system's
+        random numbers.
     patient
         Whether the carrier waits for the other end to connect, without a time limit and pauses.
     """
@@ -110,25 +114,25 @@ class CarriedLink:
 
     @property
     def connected(self) -> bool:
-        """Whether the other end was alive, and received from this end, within the deadline."""
+        """Whether, within the deadline, the other end was alive and had received from this end."""
         return self.lasts > 0.0
 
     @property
     def lasts(self) -> float:
-        """Time until the connection ends unless something is received, s; 0: not connected."""
+        """Time until the connection ends unless something is received, s; 0 if not connected."""
         if not self._open:
             return 0.0
         return max(0.0, self._until(-math.inf) - self._clock.monotonic())
 
     def _until(self, opened: float) -> float:
-        """Return when the connection ends unless something is received."""
+        """Return the time at which the connection ends unless something is received."""
         # The other end reports what it has received with its own heartbeat, up to a period later.
         heard = max(opened, self._talk.heard_at) + self._settings.period
         return min(max(opened, self._talk.alive_at), heard) + self._settings.deadline
 
     @property
     def behind(self) -> bool:
-        """Whether it is connected but the other end has not yet shown that it holds the new key."""
+        """Whether the link is connected but the other end has not yet used the new key."""
         return self.connected and self._talk.behind
 
     @property
@@ -138,12 +142,12 @@ class CarriedLink:
 
     @property
     def silent_for(self) -> float:
-        """Time since the other end was last known to be alive, in s; infinite if never."""
+        """Time since the other end was last known to be alive, s; infinite if it never was."""
         return self._heart.silent_for
 
     @property
     def problem(self) -> str:
-        """Why the link is not connected; empty while it is."""
+        """Reason why the link is not connected; empty while it is connected."""
         return "" if self.connected else self._problem
 
     @property
@@ -193,8 +197,8 @@ class CarriedLink:
             At most `LinkSettings.largest` bytes.
         expires
             Time on the monotonic clock by which the message must be delivered; otherwise it is
-            discarded. Every motion command has an expiry. None: the message does not expire, but is
-            not held either.
+            discarded. Every motion command has an expiry. If None, the message does not expire, but
+            is not held either.
         hold
             Whether to wait for a connection until the message expires. A message is held only if
             the caller requests this, and only while the caller waits; there is no queue.
@@ -259,7 +263,7 @@ class CarriedLink:
         Raises
         ------
         LinkError
-            If it is already running.
+            If the link is already running.
         """
         if self._running:
             raise LinkError(f"link to {self._name}: it is already running")

@@ -2,9 +2,10 @@
 
 A receiver can bound the age of a message without a common clock. Every envelope carries the
 sender's monotonic time, the latest *receiver* time that the sender has received, and how long ago
-it was received. The envelope was therefore sent after that time on the receiver's own clock, which
-bounds its age to within the path delay, whatever the wall clocks say. Between two such bounds the
-best one is carried forward with the sender's own times, minus the maximum drift between two clocks.
+that time was received. The envelope was therefore sent after that time on the receiver's own clock,
+which bounds its age to within the path delay, whatever the wall clocks say. Between two such bounds
+the better bound is carried forward with the sender's own times, minus the maximum drift between two
+clocks.
 
 Liveness is judged by the same bound, so heartbeats that were delayed and arrive in a burst renew
 nothing. A copy, a message from an earlier connection and a reflected message have the wrong count
@@ -52,14 +53,14 @@ class _Peer:
 
 
 class Conversation:
-    """Envelopes in and out, independent of the transport: order, freshness, authenticity.
+    """Envelopes in and out, independent of the transport: their order, freshness and authenticity.
 
     Parameters
     ----------
     clock
         Clock, of which only the monotonic time is used. The other end has its own clock.
     settings
-        `LinkSettings.horizon` and `largest` are used here.
+        Settings, of which `LinkSettings.horizon` and `largest` are used here.
     statistics
         Counters to use.
     entropy
@@ -74,9 +75,9 @@ class Conversation:
 
     Notes
     -----
-    The MAC is HMAC-SHA256 truncated to 16 bytes. With an empty key it still detects damage. During
-    a change from an old key to a new one, envelopes under either key are accepted. Each connection
-    has a new session, so that nothing from an older connection is accepted.
+    The MAC is HMAC-SHA256 truncated to 16 bytes. Even with an empty key, the MAC detects damage.
+    During a change from an old key to a new one, envelopes under either key are accepted. Each
+    connection has a new session, so that nothing from an older connection is accepted.
     """
 
     def __init__(
@@ -93,7 +94,7 @@ class Conversation:
         self.restart(lambda: (b"",))
 
     def restart(self, keys: SealKeys) -> None:
-        """Begin a new session with given keys; nothing from the old session is accepted."""
+        """Begin a new session with the given keys; nothing from the old session is accepted."""
         self._keys = keys
         self._proved: bytes | None = None
         self._session = int.from_bytes(self._entropy(8), "little") or 1
@@ -105,15 +106,15 @@ class Conversation:
 
     @property
     def behind(self) -> bool:
-        """Whether the other end has not yet shown that it holds the newest key."""
+        """Whether the other end has not yet used the newest key."""
         keys = self._keys()
         return len(keys) > 1 and self._proved != keys[0]
 
     def _sealing(self) -> tuple[bytes, ...]:
-        """Return the keys for heartbeats: the newest key that both ends hold, and newer ones.
+        """Return the keys for heartbeats: the newest key that both ends hold, and any newer keys.
 
-        The last key is the one for messages. Both ends have both keys in their lists during a key
-        change, so a newer key is offered with every heartbeat until the other end uses it.
+        The last key seals messages. Both ends have both keys in their lists during a key change, so
+        a newer key is offered with every heartbeat until the other end uses it.
         """
         keys = self._keys()
         return keys[: keys.index(self._proved) + 1] if self._proved in keys else keys
@@ -158,7 +159,7 @@ class Conversation:
         return header + message + _mac(key, header + message)
 
     def _opens(self, body: bytes, mac: bytes) -> bool:
-        """Return whether an envelope is sealed with one of the keys; note the newest key used."""
+        """Return whether an envelope is sealed with one of the keys; record the newest one used."""
         keys = self._keys()
         for key in keys:
             if hmac.compare_digest(mac, _mac(key, body)):
@@ -173,8 +174,8 @@ class Conversation:
         Returns
         -------
         arrival
-            The message and its expiry by our clock (infinite if it has none); None for a heartbeat
-            and for an envelope that must not be delivered, which is counted.
+            The message and its expiry on our clock (infinite if it has none). None for a heartbeat,
+            and for an envelope that must not be delivered; such envelopes are counted.
         prompt
             Whether to send a heartbeat at once because the other end waits for it.
         """
@@ -206,7 +207,7 @@ class Conversation:
         return (body[_HEADER.size :], expires), first
 
     def _unproved(self, kind: int, session: int, stamp: int, count: int, now: float) -> bool:
-        """Handle an envelope of unknown age: it does not show that its sender received from us."""
+        """Handle an envelope of unknown age, which does not show that its sender heard from us."""
         if kind == _DATA:
             self._statistics.refused += 1
             return False
@@ -217,7 +218,7 @@ class Conversation:
         return new
 
     def _take(self, session: int, count: int, proof: float, now: float) -> _Peer | None:
-        """Return the sender of an envelope, None if the envelope is not acceptable."""
+        """Return the sender of an envelope; None if the envelope is not acceptable."""
         peer = self._peer
         if peer is not None and peer.session == session:
             if count > peer.count:

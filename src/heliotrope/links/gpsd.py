@@ -44,7 +44,7 @@ _FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 10.0
 
 
 def gpsd_at(path: Path, text: str, key: str) -> tuple[str, int]:
-    """Return host and port of gpsd, from a key of a configuration file.
+    """Return the host and port of gpsd, read from a key of a configuration file.
 
     Raises
     ------
@@ -70,13 +70,13 @@ class SatelliteReceiver:
     device
         Name of the device in gpsd.
     mode
-        0 or 1: no fix; 2: without height; 3: with height.
+        0 or 1: no fix; 2: fix without height; 3: fix with height.
     utc_s
-        POSIX seconds of the last fix; nan: none yet.
+        POSIX seconds of the last fix; nan if there has been none.
     latitude_deg, longitude_deg, height_m
         Position of the last fix, with height above the ellipsoid; nan if unknown.
     used, seen
-        Number of satellites.
+        Numbers of satellites used and seen.
     """
 
     device: str = ""
@@ -90,7 +90,7 @@ class SatelliteReceiver:
 
     @property
     def fixed(self) -> bool:
-        """Whether the last report had a fix."""
+        """Whether the last report contained a fix."""
         return self.mode >= _FIX_2D
 
     @property
@@ -113,7 +113,7 @@ class GpsdReader:
     error
         Last error reported by gpsd; empty if there is none.
     refused
-        Number of lines that do not come from gpsd.
+        Number of received lines that cannot come from gpsd.
     """
 
     def __init__(self) -> None:
@@ -123,7 +123,7 @@ class GpsdReader:
         self._rest = b""
 
     def feed(self, data: bytes) -> bool:
-        """Accept bytes, and return whether they contained a new fix."""
+        """Accept bytes and return whether they contained a new fix."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > _LONGEST_LINE:
             self._rest, self.refused = b"", self.refused + 1
@@ -190,7 +190,7 @@ class Gpsd:
 
     @property
     def receiver(self) -> SatelliteReceiver:
-        """State of the receiver, without a fix in ``mode`` if there is no fresh fix."""
+        """State of the receiver; ``mode`` says "no fix" if there is no recent fix."""
         receiver = self._reader.receiver
         return receiver if self._fresh else replace(receiver, mode=min(receiver.mode, 1))
 
@@ -200,9 +200,9 @@ class Gpsd:
 
     @property
     def ahead(self) -> float | None:
-        """Time by which the computer's clock is ahead of the receiver, s; None without a fresh fix.
+        """Time by which the computer's clock leads the receiver, s; None without a recent fix.
 
-        It includes the delay of the fastest of the last reports, some tenths of a second.
+        The time includes the delay of the fastest recent report, a few tenths of a second.
         """
         if not self._fresh:
             return None
@@ -211,7 +211,10 @@ class Gpsd:
 
     @property
     def problem(self) -> str:
-        """Why there is no fix; empty with a fix, and while the first fix may still be pending."""
+        """Reason why there is no fix.
+
+        It is empty with a fix, and while the first fix may still be pending.
+        """
         now = self._clock.monotonic()
         if now - max(self._fixed_at, self._begun) <= _PATIENCE:
             return ""
@@ -233,7 +236,7 @@ class Gpsd:
             self._offsets.append(reader.receiver.utc_s - now)
 
     async def run(self) -> None:
-        """Keep the connection open until closed."""
+        """Keep the connection open until `close` is called."""
         await until_closed(self._closing, self._keep())
 
     async def close(self) -> None:

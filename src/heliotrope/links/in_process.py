@@ -1,4 +1,4 @@
-"""Links within one process, with seeded faults: the default, and used by the twin.
+"""Links within one process, with seeded faults; the default link, also used by the twin.
 
 The two ends exchange the same envelopes as over a network, so heartbeats, expiry and reconnection
 behave as in reality. Messages in transit are kept in a heap ordered by arrival time, so the order
@@ -25,8 +25,8 @@ class Faults:
     Parameters
     ----------
     loss, duplication, reordering, corruption
-        Probability, 0 to 1, that an envelope is lost; arrives twice; is overtaken; has one bit
-        inverted.
+        Probabilities, 0 to 1, that an envelope is lost, arrives twice, arrives after a later
+        envelope, or has one bit inverted.
     delay
         Shortest and longest time in transit, in s.
 
@@ -90,7 +90,7 @@ class _Lane:
         return bytes(damaged)
 
     def take(self) -> bytes | float | None:
-        """Return the next envelope, or the time at which it is due, or None."""
+        """Return the next envelope, or the time at which it is due; None if there is none."""
         if not self._under_way:
             return None
         due = self._under_way[0][0]
@@ -120,7 +120,7 @@ class MemoryLine:
     faults
         See `Faults`.
     reachable
-        Whether a connection can be made; False refuses each attempt.
+        Whether a connection can be made; if False, each attempt is refused.
     """
 
     def __init__(self, clock: Clock, faults: Faults | None = None, seed: int = 0) -> None:
@@ -136,16 +136,16 @@ class MemoryLine:
         )
 
     def cut(self, *, first_to_second: bool = True, second_to_first: bool = True) -> None:
-        """Lose everything sent from now on, in one or both directions; neither end is notified."""
+        """Lose all envelopes sent from now on, in one or both directions, without notice."""
         self.lanes[0].cut = first_to_second
         self.lanes[1].cut = second_to_first
 
     def heal(self) -> None:
-        """End a partition; envelopes in transit continue, lost ones stay lost."""
+        """End a partition; envelopes in transit continue, but lost envelopes stay lost."""
         self.cut(first_to_second=False, second_to_first=False)
 
     def drop(self) -> None:
-        """Break the connection as a reset does: both ends notice; envelopes in transit are lost."""
+        """Break the connection like a reset: both ends notice, and data in transit is lost."""
         self.generation += 1
         for lane in self.lanes:
             lane.clear()
@@ -165,8 +165,9 @@ class MemoryLine:
         Parameters
         ----------
         place
-            0 or 1. Of several links at one end, the last one to connect owns the line, as with a
-            shared client identifier at a broker; the other link loses it, and reconnects.
+            The end, 0 or 1. Of several links at one end, the last one to connect owns the line, as
+            with a shared client identifier at a broker; the previous owner loses the line and
+            reconnects.
         name
             Name of the other end.
         clock
@@ -205,7 +206,7 @@ class _MemoryCarrier:
         self._check()
 
     async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
-        """Put an envelope on its way; the line ignores lifetime and confirmation."""
+        """Put an envelope on the line, which ignores lifetime and confirmation."""
         del lifetime, confirmed
         self._check()
         self._out.put(envelope, self._line.faults)
@@ -227,7 +228,7 @@ class _MemoryCarrier:
                 continue
 
     async def close(self) -> None:
-        """Disconnect; the other end notices only silence."""
+        """Disconnect; the other end only notices that nothing arrives."""
         self._generation = -1
 
 
@@ -240,7 +241,7 @@ def memory_pair(
     settings: LinkSettings | None = None,
     clocks: tuple[Clock, Clock] | None = None,
 ) -> tuple[CarriedLink, CarriedLink, MemoryLine]:
-    """Return both ends of a link within this process, and the line between them.
+    """Return both ends of a link within this process, and the line between the ends.
 
     Parameters
     ----------
@@ -250,7 +251,7 @@ def memory_pair(
         Names of the first and the second end; each link bears the name of the end to which it
         leads.
     faults
-        None: a perfect line.
+        Faults of the line; None for a perfect line.
     seed
         Seed of faults, pauses and sessions: the same seed yields the same run.
     settings

@@ -1,9 +1,9 @@
-"""Keys of the links between plant and clusters: key files, and key changes while links run.
+"""Keys of the links between plant and clusters: key files, and key changes during operation.
 
 Each cluster shares one key with its plant. During a change from an old key to a new one, an end has
-both: it accepts either, and uses the new key as soon as the other end has shown that it also has
-the new key (`envelope.Conversation`). It therefore does not matter which end gets the new key
-first; nothing is lost, and no connection ends.
+both keys. It accepts either key, and uses the new key as soon as the other end has shown that it
+also has that key (`envelope.Conversation`). It therefore does not matter which end gets the new key
+first; no message is lost, and no connection ends.
 
 Keys are stored in a separate file that only its owner may read: ``plant`` and ``password``, and a
 table of keys, as hexadecimal text. If there are two keys, they form a list, the new key first.
@@ -42,12 +42,12 @@ LinkKeys = tuple[bytes, ...]
 
 
 class KeyRing:
-    """The keys of one link; they may be replaced while the link runs.
+    """The keys of one link, which may be replaced while the link runs.
 
     Attributes
     ----------
     keys
-        Keys, the newest first; replaced as a whole, so any thread may read it.
+        Keys, newest first. The tuple is replaced as a whole, so any thread may read it.
     """
 
     def __init__(self, *keys: bytes) -> None:
@@ -55,12 +55,12 @@ class KeyRing:
 
     @property
     def newest(self) -> bytes:
-        """The newest key; empty if there is none."""
+        """The newest key; empty if there is no key."""
         return self.keys[0] if self.keys else b""
 
 
 def ring_of(name: str, key: bytes | KeyRing) -> KeyRing:
-    """Return the keys of a cluster's link.
+    """Return the keys of a cluster's link as a ring.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def ring_of(name: str, key: bytes | KeyRing) -> KeyRing:
 
 @dataclass
 class BrokerPassword:
-    """The broker's password; after a change, the next connection uses the new password."""
+    """The broker's password, which may change; the next connection uses the new password."""
 
     word: str = field(repr=False)
 
@@ -92,14 +92,14 @@ class Keys:
     Parameters
     ----------
     path
-        Path of the file. None: there is no file, and there are no keys.
+        Path of the file; None if there is no file and there are no keys.
     table
         Name of the table: `HELIOSTATS` in a cluster file, `CLUSTERS` in a plant file.
 
     Attributes
     ----------
     plant, password
-        () and "" where absent.
+        Keys of the plant, and password of the broker; () and "" if absent.
     members
         Keys of the table, by name.
 
@@ -171,7 +171,7 @@ def refuse_others(path: Path) -> None:
     Raises
     ------
     FormatError
-        If others may read it.
+        If other users may read the file.
     """
     if path.stat().st_mode & _OTHERS:
         mode = path.stat().st_mode & 0o777
@@ -187,7 +187,9 @@ def fingerprint(key: bytes) -> str:
 
 
 class KeyFile:
-    """A key file to be changed; every change is written completely, with mode 600, or not at all.
+    """A key file that can be changed.
+
+    Every change is written completely, with mode 600, or not at all.
 
     Parameters
     ----------
@@ -211,7 +213,7 @@ class KeyFile:
 
     @property
     def links(self) -> dict[str, LinkKeys]:
-        """The link keys by name: by cluster, or ``plant`` in a cluster's own file."""
+        """The link keys by name: per cluster, or ``plant`` in a cluster's own file."""
         if self._held is None:
             return {}
         own = {"plant": self._held.plant} if self._held.plant else {}
@@ -223,7 +225,7 @@ class KeyFile:
         Raises
         ------
         InputError
-            If a cluster has a key, or the file is a cluster's own.
+            If a cluster already has a key, or the file is a cluster's own file.
         """
         self._check_plant(clusters)
         for name in clusters:
@@ -237,12 +239,12 @@ class KeyFile:
         return made
 
     def rotate(self, clusters: Sequence[str]) -> dict[str, bytes]:
-        """Create a new key for each cluster beside its present key; return the new keys.
+        """Create a new key for each cluster and keep the present keys; return the new keys.
 
         Raises
         ------
         InputError
-            If a cluster has no key, or two already.
+            If a cluster has no key, or already has two keys.
         """
         self._check_plant(clusters)
         made = {name: secrets.token_bytes(_SIZE) for name in clusters}
@@ -250,12 +252,12 @@ class KeyFile:
         return made
 
     def take(self, key: bytes) -> None:
-        """Add a new plant key to a cluster's file, beside the present key.
+        """Add a new plant key to a cluster's file and keep the present key.
 
         Raises
         ------
         InputError
-            If the file has that key, or two others, or is a plant's file.
+            If the file already contains that key or two other keys, or is a plant's file.
         """
         if any(name != "plant" for name in self.links):
             raise InputError(
@@ -266,7 +268,9 @@ class KeyFile:
         self._write({"plant": self._beside("plant", key) if self.links else (key,)})
 
     def end(self, names: Sequence[str]) -> list[str]:
-        """Remove the old keys of some names (() for all that have one); return these names.
+        """Remove the old keys of some names, and return the names.
+
+        () stands for all names that have an old key.
 
         Raises
         ------
@@ -330,13 +334,13 @@ def _texts(keys: LinkKeys) -> str | list[str]:
 
 
 def carried_files(folder: Path, clusters: Sequence[str]) -> list[Path]:
-    """Return the files in which new keys are carried to clusters.
+    """Return the paths of the files in which new keys are carried to clusters.
 
     Raises
     ------
     InputError
-        If no such folder, a cluster is named twice, its name cannot be a file name, or a
-        file exists, because keys are never overwritten.
+        If there is no such folder, a cluster is named twice, its name cannot be a file name, or a
+        file already exists, because keys are never overwritten.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
@@ -356,7 +360,10 @@ def carried_files(folder: Path, clusters: Sequence[str]) -> list[Path]:
 
 
 def carry(folder: Path, keys: Mapping[str, bytes]) -> list[Path]:
-    """Write a file for each cluster with its new key, to be carried to it; return the files."""
+    """Write each cluster's new key into a file that is carried to the cluster.
+
+    Return the files.
+    """
     files = carried_files(folder, list(keys))
     for path, key in zip(files, keys.values(), strict=True):
         write_private(path, tomli_w.dumps({"plant": key.hex()}), new=True)
@@ -364,7 +371,7 @@ def carry(folder: Path, keys: Mapping[str, bytes]) -> list[Path]:
 
 
 def content_of(path: Path) -> bytes:
-    """Return the content of a key file; empty if there is none."""
+    """Return the content of a key file; empty if the file is missing."""
     try:
         return path.read_bytes()
     except OSError:
@@ -372,15 +379,15 @@ def content_of(path: Path) -> bytes:
 
 
 def replace_private(path: Path, before: bytes, text: str) -> bytes:
-    """Replace a key file's content unless it changed since it was read; return the new content.
+    """Replace a key file's content unless the file has changed; return the new content.
 
-    Otherwise two simultaneous commands could drop a key that one of them has created, and that a
-    cluster may already have adopted.
+    If the file changed after it was read, it is not replaced: two simultaneous commands could
+    otherwise drop a key that one of them has created, and that a cluster may already have adopted.
 
     Raises
     ------
     InputError
-        If another command has changed the file since, or it cannot be written.
+        If another command has changed the file, or the file cannot be written.
     """
     folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -399,7 +406,7 @@ def replace_private(path: Path, before: bytes, text: str) -> bytes:
 def write_private(path: Path, text: str, *, new: bool = False) -> None:
     """Write a file that only its owner may read, completely or not at all.
 
-    An existing file is replaced and keeps its owner; with ``new``, it must not exist.
+    An existing file is replaced and keeps its owner; with ``new``, the file must not exist.
 
     Raises
     ------

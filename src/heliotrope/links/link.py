@@ -1,4 +1,4 @@
-"""Links between the plant and its clusters: byte messages, fresh or not at all.
+"""Links between the plant and its clusters: byte messages that arrive in time or not at all.
 
 A `Link` carries datagrams between two ends. It guarantees:
 
@@ -6,7 +6,7 @@ A `Link` carries datagrams between two ends. It guarantees:
 - A message with an expiry is never delivered after it, neither from a queue nor from a broker that
   was frozen nor from a socket buffer. Nothing is kept for an absent end.
 - `connected` means that the other end was alive within the deadline, and received from this end
-  within the deadline plus one period. It rests on our own heartbeats alone, whatever state the
+  within the deadline plus one period. This depends on our own heartbeats alone, whatever state the
   transport reports.
 
 `CarriedLink` (connection.py) is the only implementation; memory, TCP and MQTT differ only in their
@@ -18,8 +18,8 @@ bus is not a link: it has one master, and a node that replies does so at once (`
 
     HeliotropeError
     └── LinkError             a link cannot be made, or no longer exists
-        ├── LinkLostError     a connection is gone; the link makes another by itself
-        └── LinkClosedError   the link was closed for good
+        ├── LinkLostError     a connection is lost; the link reconnects automatically
+        └── LinkClosedError   the link was closed permanently
 """
 
 import asyncio
@@ -49,10 +49,10 @@ class LinkClosedError(LinkError):
 
 
 class SendOutcome(enum.Enum):
-    """Outcome of sending a message; the receiver may still reject the message.
+    """Outcome of sending a message, which the receiver may still reject.
 
     SENT: the transport accepted the message in time (with MQTT: the broker confirmed it). After any
-    other outcome the caller may send it again; the first message will not arrive late.
+    other outcome the caller may send the message again; the first copy will not arrive late.
     """
 
     SENT = "sent"
@@ -62,22 +62,22 @@ class SendOutcome(enum.Enum):
 
 @dataclass(slots=True)
 class Statistics:
-    """Counts of a link since it was created.
+    """Counts of a link since its creation.
 
     Attributes
     ----------
     sent, received
-        Messages handed to the transport; messages handed to the caller.
+        Messages passed to the transport; messages passed to the caller.
     dropped, expired
-        Messages not sent: because the link was not connected; because they could not be sent in
-        time.
+        Messages not sent because the link was not connected; messages not sent because there was no
+        time left.
     late, overflowed
-        Messages not delivered: older than their expiry; dropped as the oldest in a full queue.
+        Messages not delivered: after their expiry; dropped as the oldest in a full queue.
     repeated, refused, retained
-        Messages not delivered: duplicates and overtaken messages; damaged, forged or from another
-        conversation; retained by a broker.
+        Messages not delivered: duplicates and messages that arrived after a later one; damaged or
+        forged messages, or messages of another conversation; messages retained by a broker.
     opened, failures, reconnects
-        Connections made; failed attempts; connections made after the first.
+        Connections made; failed attempts; connections made after the first connection.
     last_received
         When the last envelope of any kind arrived, in s of the monotonic clock.
     """
@@ -107,13 +107,14 @@ class LinkSettings:
         Time between heartbeats, in s.
     deadline
         Silence after which the other end counts as lost, in s; at least twice the period. The
-        plant's lease to a cluster is 3 s, so the default leaves half of it.
+        plant's lease to a cluster is 3 s, so the default leaves half of the lease.
     capacity
-        Maximum number of received messages waiting for the caller; beyond it the oldest is dropped.
+        Maximum number of received messages waiting for the caller; beyond this number the oldest
+        message is dropped.
     largest
         Maximum size of a message, in bytes.
     horizon
-        Maximum time to an expiry that is accepted, in s.
+        Maximum accepted time until an expiry, in s.
     open_limit
         Timeout for making a connection, in s.
     first_pause, longest_pause
@@ -169,7 +170,7 @@ class Link(Protocol):
 
     @property
     def connected(self) -> bool:
-        """Whether the other end was alive, and received from this end, within the deadline."""
+        """Whether, within the deadline, the other end was alive and had received from this end."""
         ...
 
     @property
@@ -179,17 +180,17 @@ class Link(Protocol):
 
     @property
     def silent_for(self) -> float:
-        """Time since the other end was last known to be alive, in s; infinite if never."""
+        """Time since the other end was last known to be alive, s; infinite if it never was."""
         ...
 
     @property
     def problem(self) -> str:
-        """Why the link is not connected; empty while it is."""
+        """Reason why the link is not connected; empty while it is connected."""
         ...
 
     @property
     def statistics(self) -> Statistics:
-        """Counts since the link was created."""
+        """Counts since the link's creation."""
         ...
 
     async def run(self) -> None:
@@ -212,7 +213,7 @@ class Link(Protocol):
 
 
 class Bus(Protocol):
-    """A bus with this side as its only master, which sends a frame and reads the reply."""
+    """A bus whose only master is this side, which sends a frame and reads the reply."""
 
     @property
     def connected(self) -> bool:
@@ -237,7 +238,7 @@ class Bus(Protocol):
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return the reply; empty if there is none."""
+        """Send a frame and return the reply, which is empty if none arrives."""
         ...
 
     async def transmit(
@@ -260,9 +261,10 @@ class Backoff:
     Parameters
     ----------
     first, longest
-        In s.
+        First and longest pause, in s.
     chance
-        Generator that draws between half of a pause and all of it.
+        Generator of random numbers, which draws each pause between half its value and its full
+        value.
     """
 
     def __init__(self, first: float, longest: float, chance: random.Random) -> None:
@@ -272,7 +274,7 @@ class Backoff:
         self._pause = first
 
     def reset(self) -> None:
-        """Restart with the first pause, after a success."""
+        """Restart with the first pause after a success."""
         self._pause = self._first
 
     def next(self) -> float:
@@ -283,12 +285,12 @@ class Backoff:
 
 
 class Heartbeat:
-    """Periodic sending, and a record of how long the other side has been silent.
+    """Sends heartbeats periodically, and records how long the other side has been silent.
 
     Parameters
     ----------
     clock
-        Clock whose monotonic time decides.
+        Clock whose monotonic time is used.
     period, deadline
         Time between heartbeats, and maximum silence, in s.
     """
@@ -301,16 +303,16 @@ class Heartbeat:
         self._now = asyncio.Event()
 
     def heard(self, at: float | None = None) -> None:
-        """Note that the other side was alive, now or at a given time of the clock.
+        """Record that the other side was alive, now or at a given time of the clock.
 
-        Earlier times than the latest known one are ignored.
+        Times before the latest known time are ignored.
         """
         now = self._clock.monotonic()
         self._heard = max(self._heard, now if at is None else min(at, now))
 
     @property
     def silent_for(self) -> float:
-        """Time since the other side was alive, in s; infinite if never."""
+        """Time since the other side was alive, s; infinite if it never was."""
         return self._clock.monotonic() - self._heard
 
     @property
@@ -319,7 +321,7 @@ class Heartbeat:
         return self.silent_for <= self._deadline
 
     def prompt(self) -> None:
-        """Send a heartbeat at once, and continue the rhythm from there."""
+        """Send a heartbeat at once, and continue periodically from there."""
         self._now.set()
 
     async def run(self, beat: Callable[[], Awaitable[object]]) -> None:
@@ -386,14 +388,14 @@ class Inbox:
 
 
 async def received(link: Link) -> AsyncIterator[bytes]:
-    """Yield a link's messages one after the other, until it is closed."""
+    """Yield a link's messages one after another, until the link is closed."""
     with contextlib.suppress(LinkClosedError):
         while True:
             yield await link.receive()
 
 
 async def until_closed(closing: asyncio.Event, *parts: Coroutine[Any, Any, None]) -> None:
-    """Run parts concurrently until an event is set, then cancel them; if one fails, all end."""
+    """Run parts concurrently until an event is set, then cancel them; if one fails, cancel all."""
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(part) for part in parts]
         await closing.wait()
@@ -402,7 +404,7 @@ async def until_closed(closing: asyncio.Event, *parts: Coroutine[Any, Any, None]
 
 
 async def first_of(*parts: Coroutine[Any, Any, object]) -> None:
-    """Run parts concurrently until one ends, then cancel the others; raise what it raises."""
+    """Run parts concurrently until one ends, then cancel the others; re-raise its exception."""
     tasks = [asyncio.ensure_future(part) for part in parts]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -415,14 +417,14 @@ async def first_of(*parts: Coroutine[Any, Any, object]) -> None:
 
 
 class Runnable(Protocol):
-    """Something that is run and closed: a `Link`, a `Bus`, a server."""
+    """An object that can be run and closed: a `Link`, a `Bus`, a server."""
 
     async def run(self) -> None:
         """Run until closed."""
         ...
 
     async def close(self) -> None:
-        """End ``run``."""
+        """Make ``run`` return."""
         ...
 
 

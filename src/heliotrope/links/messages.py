@@ -60,7 +60,7 @@ NEVER = 0xFFFFFFFF
 
 
 class ProtocolError(HeliotropeError):
-    """Bytes that are not a message, or a message that this side does not know."""
+    """The bytes are not a message, or this side does not know the message."""
 
 
 class Stage(Enum):
@@ -76,11 +76,11 @@ class Stage(Enum):
 
 @dataclass(frozen=True)
 class Lease:
-    """The plant is present, and commands under this token (0: no commands are accepted).
+    """Shows that the plant is present, and permits commands under its token (0: no commands).
 
-    The cluster may continue for ``lifetime`` s after the arrival of the lease, and for ``autonomy``
-    s more. Its expiry on the link limits the time in transit. ``run`` identifies one start of one
-    plant; "" from an older plant.
+    The cluster may continue for ``lifetime`` s after the arrival of the lease, and for another
+    ``autonomy`` s. The lease's expiry on the link limits its time in transit. ``run`` identifies
+    one start of one plant; it is "" from an older plant.
     """
 
     kind: ClassVar[str] = "lease"
@@ -92,7 +92,7 @@ class Lease:
 
 @dataclass(frozen=True)
 class Command:
-    """A bus command, by its name and values, to heliostats by name ((): all).
+    """A bus command, by its name and values, for named heliostats, () for all.
 
     ``identity`` is repeated in every `Progress`. ``lifetime`` in s counts from the arrival at the
     cluster; the command arrives before its link expiry, or not at all.
@@ -109,7 +109,10 @@ class Command:
 
 @dataclass(frozen=True)
 class Emergency:
-    """DEFOCUS or STOW, to heliostats by name ((): all): accepted from any sender, with priority."""
+    """DEFOCUS or STOW for named heliostats, () for all.
+
+    It is accepted from any sender, and has priority.
+    """
 
     kind: ClassVar[str] = "emergency"
     identity: str
@@ -119,7 +122,7 @@ class Emergency:
 
 @dataclass(frozen=True)
 class Parameters:
-    """Items for the journal of one heliostat (`lcu.journal.ITEMS`), to be stored there.
+    """Items to be stored in the journal of one heliostat (`lcu.journal.ITEMS`).
 
     ``sizes`` are the sizes of the items in ``block``; ``lifetime`` is as in `Command`.
     """
@@ -137,7 +140,7 @@ class Parameters:
     def of(
         cls, identity: str, heliostat: str, items: Mapping[str, bytes], token: int
     ) -> "Parameters":
-        """Return the message for given items by name."""
+        """Return the message for items that are given by name."""
         names = tuple(items)
         sizes = tuple(len(items[name]) for name in names)
         block = b"".join(items.values())
@@ -167,11 +170,12 @@ class Parameters:
 class Ask:
     """A query.
 
-    Kind of query: ``checksums``, ``stored`` and ``diagnosis`` (for a heliostat), ``statistics``,
-    ``discover``, ``frames``. The reply to ``diagnosis`` is the ``result`` of the last motion
-    diagnosis (`lcu.diagnosis`). The reply to ``statistics`` names all heliostats in the order of
-    the rows of `ClusterStatus`. The reply to ``frames``, a record of the bus traffic, is sent when
-    its time or number is reached; its block contains a `BUS_ENTRY` and the bytes of each frame.
+    The kinds of query are ``checksums``, ``stored`` and ``diagnosis`` (for a heliostat),
+    ``statistics``, ``discover`` and ``frames``. The reply to ``diagnosis`` is the ``result`` of the
+    last motion diagnosis (`lcu.diagnosis`). The reply to ``statistics`` names all heliostats in the
+    order of the rows of `ClusterStatus`. The reply to ``frames``, a record of the bus traffic, is
+    sent when the requested time or number of frames is reached; its block contains a `BUS_ENTRY`
+    and the bytes of each frame.
     """
 
     kind: ClassVar[str] = "ask"
@@ -182,10 +186,10 @@ class Ask:
 
 @dataclass(frozen=True)
 class Acknowledge:
-    """An operator acknowledges a latched row of the cluster's safety table, shown by an `Alarm`.
+    """An operator's acknowledgement of a latched row of the cluster's safety table.
 
-    ``role`` is the name of a `safety.AcknowledgeRole`. `Progress` reports DONE, or REFUSED with the
-    reason.
+    An `Alarm` shows such a row. ``role`` is the name of a `safety.AcknowledgeRole`. `Progress`
+    reports DONE, or REFUSED with the reason.
     """
 
     kind: ClassVar[str] = "acknowledge"
@@ -200,16 +204,16 @@ class ClusterStatus:
     """State of the cluster and all its heliostats, sent once per second.
 
     ``names``, in the order of the rows, is sent in the first message of a connection and in every
-    tenth message after that, as each may be lost; otherwise it is (). ``utc_s`` is the cluster's
-    own time (POSIX seconds), ``time_error_s`` the bound on its error. ``site`` contains the
-    `Site.numbers` for which the cluster computes the sun vector; () from an older cluster.
-    ``settings`` is the checksum of the settings that all clusters should share, eight hexadecimal
-    digits (`links.common_settings`); "" from an older cluster. ``lease_left`` is in s; below 0 the
-    plant's lease has expired. ``cycle_s`` is the duration of the last poll cycle. ``run`` is the
-    plant run that the cluster belongs to, ``barred`` are the runs that get no lease. Together with
-    the names the status lists the active ``alarms`` of the cluster, each as "condition subject",
-    and ``alarms_listed`` is true; an alarm that is not listed has cleared, even if the clearing
-    message was lost.
+    tenth message after that, as any message may be lost; otherwise it is (). ``utc_s`` is the
+    cluster's own time (POSIX seconds), ``time_error_s`` the bound on its error. ``site`` contains
+    the `Site.numbers` for which the cluster computes the sun vector; it is () from an older
+    cluster. ``settings`` is the checksum of the settings that all clusters should share, eight
+    hexadecimal digits (`links.common_settings`); it is "" from an older cluster. ``lease_left`` is
+    in s; below 0 the plant's lease has expired. ``cycle_s`` is the duration of the last poll cycle.
+    ``run`` is the plant run that the cluster belongs to, ``barred`` lists the runs that get no
+    lease. A status with names also lists the active ``alarms`` of the cluster, each as "condition
+    subject", and ``alarms_listed`` is true; an alarm that is not listed has cleared, even if the
+    clearing message was lost.
     """
 
     kind: ClassVar[str] = "status"
@@ -249,7 +253,7 @@ class ClusterStatus:
 class Progress:
     """A stage that a command has reached; ``text`` states why it was refused or failed.
 
-    Without a heliostat it concerns the whole command.
+    Without a heliostat, the stage concerns the whole command.
     """
 
     kind: ClassVar[str] = "progress"
@@ -261,7 +265,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Answer:
-    """The reply to `Ask`; ``data`` is plain JSON, ``block`` contains stored bytes."""
+    """The reply to an `Ask`; ``data`` is plain JSON, ``block`` contains stored bytes."""
 
     kind: ClassVar[str] = "answer"
     identity: str
@@ -313,7 +317,7 @@ def decode(data: bytes) -> Message:
     Raises
     ------
     ProtocolError
-        If they are not a message, or are of a kind or version that this side does not know.
+        If the bytes are not a message, or this side does not know its kind or version.
     """
     line, _, block = data.partition(b"\n")
     try:

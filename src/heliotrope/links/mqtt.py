@@ -70,11 +70,11 @@ class Broker:
     Parameters
     ----------
     host, port
-        Usually port 1883, with TLS 8883.
+        Address; the port usually is 1883, or 8883 with TLS.
     username, password
-        None: the broker requires none.
+        Credentials; None if the broker requires none.
     tls
-        None: unencrypted; `heliotrope.links.tls.client_tls` makes one from files.
+        TLS context, see `heliotrope.links.tls.client_tls`; None if the connection is unencrypted.
     keepalive_s
         MQTT's own keepalive, in whole seconds. Nothing depends on it; it lets the broker clean up.
     """
@@ -89,7 +89,7 @@ class Broker:
 
 @dataclass(frozen=True)
 class _Ends:
-    """Topics and identity of one end."""
+    """Topics and identity of one end of the link."""
 
     out: str
     into: str
@@ -120,7 +120,7 @@ def _word_of(password: str | BrokerPassword | None) -> str | None:
 class _MqttCarrier:
     """Successive connections to the broker, each with a new client.
 
-    A reused client would send again, too late, whatever had been left unconfirmed.
+    A reused client would repeat all unconfirmed messages, too late.
     """
 
     def __init__(
@@ -197,13 +197,13 @@ class _MqttCarrier:
         return self._client
 
     async def ready(self) -> None:
-        """Return at once; fail if the broker no longer confirms messages."""
+        """Return at once, or fail if the broker no longer confirms messages."""
         self._connected()
         if self._unconfirmed >= _UNCONFIRMED:
             raise LinkLostError(f"the broker left {_UNCONFIRMED} messages unconfirmed")
 
     async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
-        """Publish; with ``confirmed``, return once the broker has confirmed the message."""
+        """Publish an envelope; with ``confirmed``, return once the broker has confirmed it."""
         properties = None
         if lifetime is not None:
             properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
@@ -220,7 +220,7 @@ class _MqttCarrier:
             self._unconfirmed = 0
 
     async def read(self) -> bytes:
-        """Wait for the next envelope that was not retained."""
+        """Wait for the next envelope that the broker did not retain."""
         while True:
             try:
                 message = await anext(aiter(self._connected().messages))
@@ -249,16 +249,16 @@ class _MqttCarrier:
 
 
 def _asked_of_broker(longest: int) -> Properties:
-    """Return the requests to the broker on connection: no packet larger than an envelope allows."""
+    """Return the connection requests to the broker, which limit packets to an envelope's size."""
     properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
     properties.MaximumPacketSize = longest + _ROOM
     return properties
 
 
 def _write_while_open(client: paho.Client) -> None:
-    """Have the loop write for a client, but never to the file descriptor of a closed socket.
+    """Let the loop write for a client, but never to the file descriptor of a closed socket.
 
-    aiomqtt makes that request by file descriptor, some time later; by then the descriptor may be
+    aiomqtt requests the write by file descriptor, and does so later; by then the descriptor may be
     unused, or belong to another connection.
     """
     loop = asyncio.get_running_loop()
@@ -281,7 +281,7 @@ def _refuse_socket(client: paho.Client, userdata: object, sock: "paho.SocketLike
 
 
 async def _discard(client: aiomqtt.Client) -> None:
-    """Close what remains of a client.
+    """Close the remaining parts of a client.
 
     If aiomqtt stops waiting for the broker's reply or is cancelled, it leaves the socket, its
     callbacks and a task behind, and it has no public way to end them.
@@ -318,12 +318,12 @@ def mqtt_link(
     broker
         See `Broker`.
     prefix
-        Prefix of all topics of a plant: "heliotrope/upington".
+        Prefix of all topics of a plant, such as "heliotrope/upington".
     cluster
         Name of the cluster, one level of a topic.
     key
-        Key shared by both ends, at least 16 bytes; messages under another key are rejected,
-        whatever the broker admits. The keys of a ring may change while the link runs.
+        Key shared by both ends, at least 16 bytes; messages under another key are rejected, even if
+        the broker admits them. The keys of a ring may change while the link runs.
     clock, settings
         As in `CarriedLink`.
     plant

@@ -22,7 +22,7 @@ LOOKED = 2.0
 #: An alarm is active during the last days of a certificate, and is raised again each day.
 DAYS = 30
 _DAY = 86_400.0
-#: What changes when a file does: time, inode, size and mode; None: the file is missing.
+#: Values that change when a file does: time, inode, size and mode; None if the file is missing.
 _State = tuple[int, ...] | None
 
 
@@ -41,7 +41,7 @@ class _Renewal:
         self.count = 0
 
     def look(self) -> str:
-        """Load changed files; return why they cannot be used, or an empty text.
+        """Load changed files; return why they cannot be used, or "" if they can.
 
         Files that cannot be used are tried again at each check.
         """
@@ -68,7 +68,7 @@ class _Certificate:
         self.problem = ""
 
     def look(self) -> None:
-        """Read its expiry again if the file has changed."""
+        """Read the certificate's expiry again if the file has changed."""
         current = _state(self.path)
         if self.end is not None and current == self._last_state:
             return
@@ -78,13 +78,16 @@ class _Certificate:
             self.end, self.problem = None, str(error)
 
     def days(self, now: datetime) -> int | None:
-        """Return the number of whole days left, below 0 once it has expired; None: unknown."""
+        """Return the number of whole days left.
+
+        It is below 0 once the certificate has expired, and None if the expiry is unknown.
+        """
         if self.end is None:
             return None
         return math.floor((self.end - now).total_seconds() / _DAY)
 
     def line(self, now: datetime) -> str:
-        """Return its expiry in words."""
+        """Return the certificate's expiry in words."""
         days = self.days(now)
         if days is None or self.end is None:
             return f"the end of certificate {self.path} is unknown ({self.problem})"
@@ -112,11 +115,14 @@ class Papers:
         self._reported: dict[Path, tuple[int | None, str]] = {}
 
     def renew(self, name: str, files: Sequence[Path], take: Callable[[], None]) -> None:
-        """Call ``take`` in a thread whenever one of some files changes, and once at start-up."""
+        """Register a function to be called when files change.
+
+        ``take`` is called in a thread whenever one of the files changes, and once at start-up.
+        """
         self._renewals[name] = _Renewal(files, take)
 
     def watch_end(self, path: Path) -> None:
-        """Monitor the expiry of a certificate, or of the first to expire in a file with several."""
+        """Monitor the expiry of the certificate in a file; if it has several, the earliest."""
         self._certificates.append(_Certificate(path))
 
     def lines(self) -> list[str]:
@@ -130,7 +136,7 @@ class Papers:
     async def watched(
         self, on_alarm: Callable[[Alarm], None], on_renewed: Callable[[str], None] | None = None
     ) -> AsyncIterator[None]:
-        """Check the files during a block, raise and end alarms, and report what was renewed."""
+        """Check the files during a block, raise and clear alarms, and report renewed files."""
         failure: Exception | None = None
         async with asyncio.TaskGroup() as group:
             task = group.create_task(self._run(on_alarm, on_renewed))
@@ -154,7 +160,7 @@ class Papers:
             await asyncio.sleep(LOOKED)
 
     def look(self) -> list[Alarm]:
-        """Load files that have changed; return alarms that begin, end, or are repeated."""
+        """Load changed files; return the alarms that begin, end or are repeated."""
         changes = []
         for name, renewal in self._renewals.items():
             problem = renewal.look()
@@ -169,7 +175,7 @@ class Papers:
         return changes
 
     def renewed(self) -> list[str]:
-        """Return the files reloaded since the last call; the first load does not count."""
+        """Return the files reloaded since the last call, not counting the first load."""
         before, self._counts = self._counts, {n: r.count for n, r in self._renewals.items()}
         return [n for n, count in self._counts.items() if count > max(1, before.get(n, 0))]
 
@@ -199,7 +205,7 @@ def _state(path: Path) -> _State:
 
 
 def end_of(path: Path) -> datetime:
-    """Return the expiry of a PEM certificate; of several, the first to expire.
+    """Return the expiry of a PEM certificate; of several certificates, the earliest.
 
     Raises
     ------
@@ -225,7 +231,7 @@ def end_of(path: Path) -> datetime:
 
 
 def authority_of(papers: Papers, path: Path) -> RenewedTls:
-    """Return the TLS of a client that trusts only one authority, renewed with its file."""
+    """Return TLS for a client that trusts only one authority; it is renewed with its file."""
     tls = RenewedTls(lambda: client_tls(path))
     papers.renew("certificate of the authority", [path], tls.renew)
     papers.watch_end(path)

@@ -1,4 +1,4 @@
-"""A link with a listener that sees all messages of the link's owner, and may delay them."""
+"""A link with a listener that sees all messages of the link's owner and may delay them."""
 
 from typing import Protocol
 
@@ -10,19 +10,25 @@ class LinkListener(Protocol):
     """A listener at one end of a link."""
 
     async def posted(self, data: bytes, now: float) -> None:
-        """Note a message that the owner passes to the link; it is sent once this method returns."""
+        """Record a message that the owner passes to the link.
+
+        The message is sent once this method returns.
+        """
         ...
 
     def sent(self, data: bytes, now: float) -> None:
-        """Note a message that has been sent, and when it was passed to the transport."""
+        """Record a message that has been sent, and when it was passed to the transport."""
         ...
 
     async def waits(self) -> None:
-        """Note that the owner waits for a message; the link is read once this method returns."""
+        """Record that the owner waits for a message.
+
+        The link is read once this method returns.
+        """
         ...
 
     def received(self, data: bytes, now: float) -> None:
-        """Note a message that the owner receives."""
+        """Record a message that the owner receives."""
         ...
 
 
@@ -34,7 +40,7 @@ class TappedLink:
     inner
         The link itself.
     clock
-        Its monotonic time is passed to the listener.
+        Clock whose monotonic time is passed to the listener.
     listener
         Called for every message.
 
@@ -65,17 +71,17 @@ class TappedLink:
 
     @property
     def silent_for(self) -> float:
-        """Time since the other end was last known to be alive, in s; infinite if never."""
+        """Time since the other end was last known to be alive, s; infinite if it never was."""
         return self.inner.silent_for
 
     @property
     def problem(self) -> str:
-        """Why the link is not connected; empty while it is."""
+        """Reason why the link is not connected; empty while it is connected."""
         return self.inner.problem
 
     @property
     def statistics(self) -> Statistics:
-        """Counts since the link was created."""
+        """Counts since the link's creation."""
         return self.inner.statistics
 
     async def run(self) -> None:

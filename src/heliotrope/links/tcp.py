@@ -1,8 +1,8 @@
 """Links over TCP: a server for the plant, a client for each cluster.
 
 A frame is a length of 4 bytes (big-endian) and an envelope. COBS would let a reader find the next
-frame after lost bytes, but TCP loses none. A length above the limit, or below that of an
-authentication tag, is rejected before any of the frame is stored, and ends the connection.
+frame after lost bytes, but TCP loses none. A length above the limit, or below the length of an
+authentication tag, is rejected before any part of the frame is stored, and ends the connection.
 
 The handshake has one frame per step: server, 32 random bytes; client, 32 random bytes, its
 authentication tag and its name; server, its authentication tag. A tag is HMAC-SHA256 of a label,
@@ -47,7 +47,7 @@ _NEWCOMERS, _NEWCOMERS_EACH = 64, 16
 
 
 class _Pipe(asyncio.Protocol):
-    """A connection as frames: bytes in, frames out."""
+    """A connection that carries frames."""
 
     def __init__(self, largest: int, arrived: "Callable[[_Pipe], None] | None" = None) -> None:
         self.largest = largest
@@ -65,7 +65,7 @@ class _Pipe(asyncio.Protocol):
         self._ended = asyncio.Event()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Configure the socket, and report to the server, if there is one."""
+        """Configure the socket and report the connection to the server, if there is one."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
         transport.set_write_buffer_limits(high=0)
@@ -81,7 +81,7 @@ class _Pipe(asyncio.Protocol):
             self._arrived(self)
 
     async def begin(self, tls: ssl.SSLContext | None, limit: float) -> None:
-        """Begin to read as a server, after the TLS handshake if there is one."""
+        """Start reading as a server, after the TLS handshake if there is one."""
         transport = self._transport
         if transport is None:
             raise LinkLostError(self._lost)
@@ -124,15 +124,15 @@ class _Pipe(asyncio.Protocol):
         self._stranger, self.largest = False, largest
 
     def pause_writing(self) -> None:
-        """Pause writing: the transport's buffer is full."""
+        """Stop writing, because the transport's buffer is full."""
         self._writable.clear()
 
     def resume_writing(self) -> None:
-        """Resume writing: the transport's buffer is empty."""
+        """Resume writing, because the transport's buffer is empty."""
         self._writable.set()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Note that the transport has ended."""
+        """Record that the transport has ended."""
         self._lost = self._lost or (str(exc) if exc else "the other end closed the connection")
         self._transport = None
         self._ended.set()
@@ -185,7 +185,10 @@ def _proof(key: bytes, label: bytes, server: bytes, client: bytes, name: bytes) 
 
 
 def _derived(ring: KeyRing, server: bytes, client: bytes, name: bytes) -> SealKeys:
-    """Return the connection's keys: one for each key of the ring, updated whenever it changes."""
+    """Return the connection's keys.
+
+    There is one for each key of the ring; they are updated whenever the ring changes.
+    """
     made: dict[bytes, bytes] = {}
 
     def keys() -> tuple[bytes, ...]:
@@ -198,7 +201,7 @@ def _derived(ring: KeyRing, server: bytes, client: bytes, name: bytes) -> SealKe
 
 
 async def _introduce(pipe: _Pipe, name: str, key: bytes, ring: KeyRing) -> SealKeys:
-    """Authenticate both ends from the client's side, and return the connection's keys."""
+    """Authenticate both ends as the client, and return the connection's keys."""
     server, client, title = await pipe.read(), secrets.token_bytes(_NONCE), name.encode()
     if len(server) != _NONCE:
         raise LinkError("the program that answers there does not speak this protocol")
@@ -215,7 +218,7 @@ async def _introduce(pipe: _Pipe, name: str, key: bytes, ring: KeyRing) -> SealK
 
 
 async def _greet(pipe: _Pipe, rings: Mapping[str, KeyRing], largest: int) -> tuple[str, SealKeys]:
-    """Authenticate the client from the server's side; return its name and the connection's keys."""
+    """Authenticate the client as the server; return its name and the connection's keys."""
     server = secrets.token_bytes(_NONCE)
     pipe.write(server)
     frame = await pipe.read()
@@ -238,14 +241,14 @@ async def _greet(pipe: _Pipe, rings: Mapping[str, KeyRing], largest: int) -> tup
 
 
 class _TcpCarrier:
-    """A carrier over pipes that are connected elsewhere."""
+    """A carrier over pipes that another object connects."""
 
     def __init__(self, connect: Callable[[], Awaitable[tuple[_Pipe, SealKeys]]]) -> None:
         self._connect = connect
         self._pipe: _Pipe | None = None
 
     async def open(self) -> SealKeys:
-        """Connect a pipe whose other end is authenticated; return its keys."""
+        """Connect a pipe whose other end is authenticated; return the connection's keys."""
         self._pipe, keys = await self._connect()
         return keys
 
@@ -276,7 +279,7 @@ class _TcpCarrier:
 
 @dataclass
 class _Client:
-    """A carrier that connects to the server."""
+    """A carrier that connects to a server."""
 
     host: str
     port: int
@@ -305,12 +308,12 @@ class _Client:
 
 
 class _Newcomers:
-    """Connections in their handshake, limited in total and per address; the oldest is closed first.
+    """Connections during their handshake, limited in total and per address.
 
     Parameters
     ----------
     clusters
-        Number of clusters, all of which may connect at once and from one address.
+        Number of clusters, all of which may connect at once from one address.
     """
 
     def __init__(self, clusters: int) -> None:
@@ -318,7 +321,7 @@ class _Newcomers:
         self._pipes: dict[_Pipe, None] = {}
 
     def enter(self, pipe: _Pipe) -> None:
-        """Admit a connection; beyond the limits close the oldest of the busiest address."""
+        """Admit a connection; beyond the limits, close the busiest address's oldest connection."""
         self._pipes[pipe] = None
         counts = Counter(other.address for other in self._pipes)
         busiest = pipe.address
@@ -336,7 +339,10 @@ class _Newcomers:
 
 
 class _Slot:
-    """The place where a cluster's connection waits for its link; a new one ends the previous."""
+    """A place where a cluster's connection waits for its link.
+
+    A new connection ends the previous one.
+    """
 
     def __init__(self) -> None:
         self._offer: tuple[_Pipe, SealKeys] | None = None
@@ -352,7 +358,7 @@ class _Slot:
         self._offered.set()
 
     async def take(self) -> tuple[_Pipe, SealKeys]:
-        """Wait for the cluster."""
+        """Wait for the cluster to connect and return the connection."""
         while self._offer is None:
             self._offered.clear()
             await self._offered.wait()
@@ -387,7 +393,7 @@ def tcp_link(
     clock, settings
         As in `CarriedLink`.
     tls
-        See `client_tls`; None: authenticated but not encrypted.
+        See `client_tls`; None for a connection that is authenticated but not encrypted.
 
     Raises
     ------
@@ -406,7 +412,7 @@ class TcpServer:
     Parameters
     ----------
     host, port
-        Address to listen on; port 0: any free port, shown by ``port``.
+        Address to listen on; with port 0, any free port, which the attribute ``port`` shows.
     keys
         Name and key of each cluster, at least 16 bytes each; the keys of a ring may change.
     clock, settings
@@ -417,13 +423,13 @@ class TcpServer:
     Attributes
     ----------
     links
-        The links by cluster name; ``run`` runs them.
+        The links, by cluster name; ``run`` runs them.
     port
-        Port on which it listens; 0 before it does.
+        Port on which the server listens; 0 before it listens.
     refused
         Number of connections that failed the handshake.
     last_refusal
-        Why the last of these was rejected.
+        Reason why the last of these connections was rejected.
 
     Raises
     ------
@@ -477,7 +483,7 @@ class TcpServer:
         Raises
         ------
         LinkError
-            If it cannot listen at that address.
+            If the server cannot listen at that address.
         """
         try:
             server = await asyncio.get_running_loop().create_server(

@@ -6,12 +6,12 @@ from pathlib import Path
 
 from heliotrope.errors import InputError
 
-#: A context, or a function that returns the present context; None: no TLS.
+#: A context, or a function that returns the present context; None if there is no TLS.
 TlsSource = ssl.SSLContext | Callable[[], ssl.SSLContext] | None
 
 
 def context_of(source: TlsSource) -> ssl.SSLContext | None:
-    """Return the present context, None without TLS."""
+    """Return the present TLS context; None if there is no TLS."""
     return source if source is None or isinstance(source, ssl.SSLContext) else source()
 
 
@@ -44,7 +44,7 @@ def server_tls(
     certificate, key
         The server's own certificate and key.
     authority
-        Authority that signed the clusters' certificates; None: clusters need no certificate,
+        Authority that signed the clusters' certificates; None if clusters need no certificate,
         because they have keys.
 
     Raises
@@ -91,12 +91,14 @@ def client_tls(
 
 
 class RenewedTls:
-    """A TLS context that is recreated when its files are renewed; connections keep the old context.
+    """A TLS context that is recreated when its files are renewed.
+
+    Existing connections keep the old context.
 
     Parameters
     ----------
     make
-        Function that creates it from the files.
+        Function that creates a context from the files.
 
     Raises
     ------

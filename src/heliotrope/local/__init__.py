@@ -1,8 +1,9 @@
 """The local interface of a running plant: frames over Unix sockets, with limits on all resources.
 
 `LocalServer` listens in the plant's process; `LocalConnection` (asyncio) and `ask_once` (blocking)
-call it. The package is independent of the plant: `plant.interface` defines the calls and who may
-make them. It needs only the standard library, so that an emergency command starts at once.
+call it. The package is independent of the plant: `plant.interface` defines the calls and the
+callers allowed to make them. The package needs only the standard library, so that an emergency
+command starts at once.
 
 Begin with `frames`.
 """

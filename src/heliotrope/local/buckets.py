@@ -1,4 +1,4 @@
-"""Token buckets: limit how often something may happen, per key."""
+"""Token buckets, which limit how often something may happen, per key."""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -16,7 +16,7 @@ class Buckets:
     monotonic
         Function that returns the time, s.
     largest
-        Maximum number of keys that are kept; the least recently used are dropped first.
+        Maximum number of keys that are kept; the least recently used keys are dropped first.
     """
 
     def __init__(
@@ -26,7 +26,7 @@ class Buckets:
         self._kept: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, key: str) -> float:
-        """Take a token; return 0 if one was taken, else the time until one is available, s."""
+        """Take a token; return 0 if one was taken, otherwise the time until one is available, s."""
         now = self._now()
         tokens, at = self._kept.pop(key, (self._burst, now))
         tokens = min(self._burst, tokens + self._rate * (now - at))

@@ -28,7 +28,7 @@ class AwayError(HeliotropeError):
 
 
 class CallError(HeliotropeError):
-    """A call that the plant's process refused; ``kind`` is the kind of error."""
+    """The plant's process refused a call; ``kind`` is the kind of error."""
 
     def __init__(self, kind: str, text: str) -> None:
         super().__init__(text)
@@ -49,7 +49,7 @@ def value_of(answer: Frame) -> Any:
 
 
 class LocalConnection:
-    """A persistent connection that is reopened whenever it has ended.
+    """A persistent connection, which is reopened whenever it ends.
 
     Parameters
     ----------
@@ -127,7 +127,9 @@ class LocalConnection:
         on_behalf: Any = None,
         within: float | None = None,
     ) -> tuple[Any, bytes]:
-        """Make a call; return value and blob of the reply, within a separate timeout if set, s.
+        """Make a call; return the value and the blob of the reply.
+
+        ``within`` is a separate timeout for this call, s.
 
         Raises
         ------
@@ -176,7 +178,7 @@ def ask_once(
     blob: bytes = b"",
     timeout: float = 30.0,
 ) -> Any:
-    """Connect, make one call, and return the value of the reply; see `fetch_once`."""
+    """Connect, make one call and return the value of the reply; see `fetch_once`."""
     return fetch_once(path, hello, call, arguments, blob, timeout)[0]
 
 
@@ -188,7 +190,7 @@ def fetch_once(
     blob: bytes = b"",
     timeout: float = 30.0,
 ) -> tuple[Any, bytes]:
-    """Connect, make one call, and return the value and blob of the reply; without an event loop.
+    """Connect, make one call and return the reply's value and blob, without an event loop.
 
     Raises
     ------

@@ -2,9 +2,9 @@
 
 A frame is the mark ``HLP1``, the lengths of head and blob (uint32 each, little-endian), the head (a
 JSON object) and the blob (bytes). A request has ``id``, ``call``, ``arguments`` and, if a console
-sends it, ``for``: the person on whose behalf it is made. A reply has the ``id`` with a ``value``,
-or with ``error`` (its kind) and ``text``. The first frame of a connection identifies the caller:
-``key`` or ``token``.
+sends it, ``for``: the person on whose behalf the request is made. A reply has the ``id`` with a
+``value``, or with ``error`` (its kind) and ``text``. The first frame of a connection identifies the
+caller: ``key`` or ``token``.
 """
 
 import asyncio
@@ -34,7 +34,7 @@ ANSWER_HEAD, ANSWER_BLOB = 64 << 20, 64 << 20
 
 
 class FrameError(HeliotropeError):
-    """Bytes that are not a frame, or a frame that is too large."""
+    """The bytes are not a frame, or the frame is too large."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ def head_of(data: bytes) -> dict[str, Any]:
     Raises
     ------
     FrameError
-        If it is not a JSON object, or contains a number or text that no reply could return: an
-        infinite number, or half of a surrogate pair.
+        If the head is not a JSON object, or contains a number or text that no reply could return:
+        an infinite number, or half of a surrogate pair.
     """
     try:
         # As text, because json would accept surrogates and UTF-16 in bytes.
@@ -108,7 +108,7 @@ async def read_frame(
     most_blob: int = ANSWER_BLOB,
     accepts: Callable[[dict[str, Any]], bool] = lambda _: True,
 ) -> Frame:
-    """Read one frame; its blob is kept if ``accepts`` holds for its head, else skipped.
+    """Read one frame; skip its blob unless ``accepts`` returns True for its head.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""Log lines: one per record, of bounded length, in which foreign text cannot start a new line.
+"""Log lines of bounded length, one per record, in which foreign text cannot start a new line.
 
-A record may contain text that a client has sent, in its message or in the error that it reports.
+A record may contain text that a client has sent, either in its message or in the reported error.
 Control characters, including those that only some programs treat as line breaks and those that
 reverse the text direction, are escaped; the lines of a traceback begin with a marker.
 """
@@ -15,7 +15,7 @@ _MARK = "  | "
 
 
 class LogLines(logging.Formatter):
-    """Formats records as such lines."""
+    """Formats records as safe log lines."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the lines of a record."""
@@ -27,7 +27,7 @@ class LogLines(logging.Formatter):
 
 
 def install() -> None:
-    """Write warnings and errors of this process to standard error in such lines."""
+    """Write warnings and errors of this process to standard error as safe log lines."""
     root = logging.getLogger()
     if not root.handlers:
         handler = logging.StreamHandler()

@@ -1,12 +1,12 @@
-"""The server side of the local interface: all resources are limited, and newcomers get in.
+"""The server side of the local interface, which limits all resources and admits new callers.
 
 Connections are accepted at a limited rate. A connection that does not identify itself in time is
 closed; if all places are taken, the oldest connection is closed to make room. A connection has a
-limited number of pending requests; while they are pending, nothing more is read from it. A request
-counts until its reply is written, and a client that does not read its replies is disconnected. A
-blob is accepted only if the call allows one from this caller. The identity of the caller is checked
-again every few seconds: a connection ends when its key or token is no longer valid, and its
-requests never have more than the current role.
+limited number of pending requests; while these are pending, nothing more is read from the
+connection. A request counts until its reply is written, and a client that does not read its replies
+is disconnected. A blob is accepted only if the call allows one from this caller. The identity of
+the caller is checked again every few seconds: a connection ends when its key or token is no longer
+valid, and its requests never have more than the current role.
 """
 
 import asyncio
@@ -59,12 +59,12 @@ class LocalLimits:
     Attributes
     ----------
     strangers, callers, reserved
-        Maximum number of connections without identification, with identification, and from
+        Maximum numbers of connections without identification, with identification, and from
         consoles; a new connection may overlap one that is ending.
     under_way, console_under_way
         Pending requests per connection, and per console connection, which many operators share.
     hello_s, answer_s
-        Timeout for identifying the caller, and for taking a reply, s.
+        Timeouts for identifying the caller and for accepting a reply, s.
     pace_s
         Minimum time between two new connections, s.
     trusted_s
@@ -105,7 +105,7 @@ class _Peer:
 
 
 class _Identity(Generic[C]):
-    """The caller of a connection, determined again when the last result is old."""
+    """The caller of a connection, who is determined again when the last result is old."""
 
     def __init__(self, ask: Callable[[], Awaitable[C | None]], trusted: float) -> None:
         self._ask, self._trusted, self._turn = ask, trusted, asyncio.Lock()
@@ -113,7 +113,7 @@ class _Identity(Generic[C]):
         self._until = 0.0
 
     async def caller(self) -> C | None:
-        """Return the caller, None if they are no longer valid."""
+        """Return the caller; None if the caller is no longer valid."""
         async with self._turn:
             if time.monotonic() >= self._until:
                 asked = time.monotonic()
@@ -130,15 +130,16 @@ class LocalServer(Generic[C]):
     path
         Socket, in a folder made by `sockets.make_folder`.
     caller
-        Function that returns who sent the first frame of a connection, given that frame and the
-        user of the process, which is the plant's user or root; None rejects the connection. It is
-        called again while the connection lasts, see `LocalLimits.trusted_s`.
+        Function that returns the sender of a connection's first frame, given that frame and the
+        user of the sending process, which is the plant's user or root. If it returns None, the
+        connection is rejected. The function is called again while the connection lasts, see
+        `LocalLimits.trusted_s`.
     answer
-        Function that returns value and blob of the reply to a request.
+        Function that returns the value and the blob of the reply to a request.
     kinds
-        Function that returns kind and text of an error for the client.
+        Function that returns the kind and the text of an error for the client.
     blob
-        Function that returns whether the call in a head may carry a blob, from this caller.
+        Function that returns whether the call in a head may carry a blob from this caller.
     limits
         See `LocalLimits`.
     """
@@ -163,12 +164,12 @@ class LocalServer(Generic[C]):
         self._reserved: list[_Peer] = []
 
     def open(self) -> None:
-        """Listen.
+        """Start listening.
 
         Raises
         ------
         InputError
-            If it cannot listen there.
+            If the server cannot listen at the path.
         """
         self._listener = listen(self._path)
 
@@ -192,7 +193,7 @@ class LocalServer(Generic[C]):
             self.close()
 
     def close(self) -> None:
-        """Stop listening; a second call does nothing."""
+        """Stop listening; a second call has no effect."""
         if self._listener is not None:
             self._listener.close()
             self._path.unlink(missing_ok=True)
@@ -223,7 +224,7 @@ class LocalServer(Generic[C]):
     async def _identified(
         self, reader: asyncio.StreamReader, peer: _Peer, user: int
     ) -> tuple[_Identity[C], C] | None:
-        """Return how to determine the caller again, and the caller; None if rejected."""
+        """Return a function that determines the caller again, and the caller; None if rejected."""
         async with asyncio.timeout(self._limits.hello_s):
             hello = await read_frame(reader, HELLO_HEAD, 0)
             ask = functools.partial(self._caller, hello.head, user)
@@ -276,7 +277,7 @@ class LocalServer(Generic[C]):
     async def _answer_one(
         self, frame: Frame, peer: _Peer, identity: _Identity[C], room: asyncio.Semaphore
     ) -> None:
-        """Answer one request of a caller who is currently valid."""
+        """Answer one request from a caller who is currently valid."""
         number, blob = frame.head["id"], b""
         if (caller := await identity.caller()) is None:
             await self._refuse(peer, number)
@@ -297,7 +298,7 @@ class LocalServer(Generic[C]):
 
 
 def _place(pool: list[_Peer], peer: _Peer, most: int) -> None:
-    """Add a connection; if the pool is full, the oldest is closed."""
+    """Add a connection to a pool; if the pool is full, close the oldest connection."""
     while len(pool) >= most:
         pool.pop(0).cut()
     pool.append(peer)

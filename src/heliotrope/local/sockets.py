@@ -31,7 +31,7 @@ def socket_folder(data: Path) -> Path:
 
 
 def name_here(user: int) -> str:
-    """Return the name under which a user of this computer is recorded; a number if unnamed."""
+    """Return the name under which a user of this computer is recorded, or else a number."""
     try:
         return f"{pwd.getpwuid(user).pw_name} on this machine"
     except KeyError:
@@ -44,7 +44,7 @@ def make_folder(folder: Path) -> None:
     Raises
     ------
     InputError
-        If it cannot be created, or belongs to another user.
+        If the folder cannot be created, or belongs to another user.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -60,7 +60,7 @@ def make_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def _short(path: Path) -> Iterator[str]:
-    """Yield an address for a socket whose path may be too long for one."""
+    """Yield an address for a socket, even if the path is too long for a socket address."""
     if len(os.fsencode(path)) <= _LONGEST:
         yield str(path)
         return
@@ -72,12 +72,12 @@ def _short(path: Path) -> Iterator[str]:
 
 
 def listen(path: Path) -> socket.socket:
-    """Return a listening socket that only this user can connect to; a stale one is replaced.
+    """Return a listening socket that only this user can connect to.
 
     Raises
     ------
     InputError
-        If it cannot listen there.
+        If it is not possible to listen at the path.
     """
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
@@ -94,12 +94,12 @@ def listen(path: Path) -> socket.socket:
 
 
 def connect(path: Path, timeout: float) -> socket.socket:
-    """Return a connected socket, blocking for ``timeout`` s at most.
+    """Return a connected socket, blocking for at most ``timeout`` s.
 
     Raises
     ------
     OSError
-        If nothing listens there, or another user does, who would then receive our key or token.
+        If nobody listens there, or another user does, who would then receive our key or token.
     """
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     made.settimeout(timeout)
@@ -110,7 +110,7 @@ def connect(path: Path, timeout: float) -> socket.socket:
                 try:
                     made.connect(address)
                     break
-                except BlockingIOError:  # others wait to be accepted: try again
+                except BlockingIOError:  # other connections wait to be accepted: try again
                     if time.monotonic() > until:
                         raise
                     time.sleep(_AGAIN)
@@ -123,9 +123,9 @@ def connect(path: Path, timeout: float) -> socket.socket:
 
 
 def user_of(peer: socket.socket) -> int | None:
-    """Return the user of the process at the other end if it is this user or root, else None.
+    """Return the user of the process at the other end; None unless it is this user or root.
 
-    The kernel vouches for it (SO_PEERCRED).
+    The kernel guarantees this information (SO_PEERCRED).
     """
     try:
         data = peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)

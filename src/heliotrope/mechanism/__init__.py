@@ -5,7 +5,7 @@ one with `azimuth_elevation`, `two_jacks`, … (`kinds`), give it drives (`rotar
 …), set its imperfections with `Mechanism.with_parameters`, and point it with `track`. `Machine`
 holds the motor limits and the rest positions.
 
-Use the names in these modules through the module:
+Access the names in these modules through the module:
 
 - `guo`: Guo's closed-form solution for azimuth-elevation heliostats, a cross-check of `track`.
 - `parameters`: the parameter table and the models.

@@ -32,7 +32,7 @@ _SIDES = 8
 
 @dataclass(frozen=True)
 class Moving:
-    """Points of one heliostat at T moments, ENU, m.
+    """Points of one heliostat at T times, ENU, m.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Moving:
 
 
 def moving(mechanism: Mechanism, angles: npt.ArrayLike, width: float, height: float) -> Moving:
-    """Return the points of a heliostat at joint angles.
+    """Return the points of a heliostat at given joint angles.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def moving(mechanism: Mechanism, angles: npt.ArrayLike, width: float, height: fl
     Raises
     ------
     InputError
-        Not one mechanism with two drives, or angles of another shape.
+        If ``mechanism`` is not one mechanism with two drives, or the angles have another shape.
     """
     theta = _angles(mechanism, angles)
     arm = mechanism.armature
@@ -108,7 +108,10 @@ def _angles(mechanism: Mechanism, angles: npt.ArrayLike) -> FloatArray:
 
 
 def _corners(mechanism: Mechanism, width: float, height: float) -> FloatArray:
-    """Corners from the vertex at zero angles, (4, 3): the secondary axis lies along an edge."""
+    """Return the mirror corners relative to the vertex at zero angles, (4, 3).
+
+    The secondary axis is parallel to an edge.
+    """
     arm = mechanism.armature
     along = arm.axis_2 - (arm.axis_2 @ arm.normal) * arm.normal
     across = tangent_axes(arm.normal)[0] if np.linalg.norm(along) < 1e-6 else normalize(along)
@@ -139,7 +142,7 @@ def glb(
     Raises
     ------
     InputError
-        As `moving`, or times that do not ascend.
+        As for `moving`, or if the times are not ascending.
     """
     theta = _angles(mechanism, angles)
     times = np.asarray(seconds, dtype=np.float64)
@@ -176,13 +179,18 @@ def glb(
 
 
 def _turns(axis: FloatArray, angle: FloatArray) -> FloatArray:
-    """Quaternions (x, y, z, w) of rotations about an axis, (T, 4), each near the one before."""
+    """Return quaternions (x, y, z, w) of rotations about an axis, (T, 4).
+
+    Quaternions of neighbouring angles are close to each other.
+
+    The sign of each is chosen to be near the previous one.
+    """
     half = 0.5 * angle[:, None]
     return np.concatenate([np.sin(half) * axis, np.cos(half)], axis=1)
 
 
 def _rod(along: FloatArray, radius: float) -> tuple[FloatArray, npt.NDArray[np.uint32]]:
-    """Vertices and triangles of a rod from the origin."""
+    """Return the vertices and triangles of a rod that starts at the origin."""
     return _tube(np.zeros(3), along, radius)
 
 
@@ -262,7 +270,7 @@ class _Gltf:
         return self._add("accessors", made)
 
     def mesh(self, material: str, points: FloatArray, faces: npt.NDArray[np.uint32]) -> int:
-        """Add a mesh; return its number."""
+        """Add a mesh and return its index."""
         place = self._accessor(points.astype(np.float32), "VEC3", limits=True)
         corners = self._accessor(faces.ravel(), "SCALAR")
         part = {
@@ -279,7 +287,7 @@ class _Gltf:
         mesh: int | None = None,
         children: list[int] | None = None,
     ) -> int:
-        """Add a node; return its number."""
+        """Add a node and return its index."""
         made: dict[str, Any] = {"name": name}
         if offset is not None:
             made["translation"] = [float(v) for v in offset]
@@ -297,7 +305,7 @@ class _Gltf:
         self._document |= {"scene": 0, "scenes": [{"nodes": [number]}]}
 
     def animate(self, times: FloatArray, turns: dict[int, FloatArray]) -> None:
-        """Add an animation of rotations (T, 4) of nodes."""
+        """Add an animation of nodes by rotations (T, 4)."""
         clock = self._accessor(times.astype(np.float32), "SCALAR", limits=True)
         samplers: list[dict[str, Any]] = []
         channels: list[dict[str, Any]] = []

@@ -1,4 +1,4 @@
-"""The armature: everything that tracking needs to know about a mechanism, in 18 numbers.
+"""The armature: all that tracking needs to know about a mechanism, in 18 numbers.
 
 Whatever its fixed imperfections, a two-axis chain rotates a vertex and a normal about two lines in
 space. Grigoriev et al. 2021 call this reduced form the armature. A local controller stores only the
@@ -50,7 +50,7 @@ class Armature(Value, Framed):
         vertex: npt.ArrayLike,
         normal: npt.ArrayLike,
     ) -> "Armature":
-        """Build an armature from its six vectors (..., 3), ENU metres; directions of any length.
+        """Build an armature from its six vectors (..., 3), ENU, m; directions may have any length.
 
         Raises
         ------
@@ -105,7 +105,7 @@ class Armature(Value, Framed):
         return self.table[..., slot.NORMAL : slot.NORMAL + 3]
 
     def pose(self, angles: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return the normal and the vertex (..., 3) at joint angles (..., 2) in radians."""
+        """Return the normal and the vertex, each (..., 3), at joint angles (..., 2) in radians."""
         theta = np.asarray(angles, dtype=np.float64)
         first = rotation(self.axis_1, theta[..., 0])
         second = rotation(self.axis_2, theta[..., 1])

@@ -1,4 +1,4 @@
-"""Offset and scatter of each heliostat axis: Guo's evaluation of tracking data, (43)-(47)."""
+"""Zero and scatter of each heliostat axis: Guo's evaluation of tracking data, (43)-(47)."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from heliotrope.mechanism.guo import numbers, refuse
 
 @dataclass(frozen=True, eq=False)
 class AxisAccuracy:
-    """Zeros and scatter of the two axes, all in rad, shape (...).
+    """Zeros and scatter of the two axes, each in rad, shape (...).
 
     Attributes
     ----------
     gamma_0, alpha_0
-        Mean of measured minus computed angles, the estimates of ``azimuth_zero`` and
+        Mean of measured minus computed angles; these are the estimates of ``azimuth_zero`` and
         ``elevation_zero``.
     sigma_gamma, sigma_alpha
         Standard deviation about the mean.
@@ -49,11 +49,11 @@ def axis_accuracy(
     Parameters
     ----------
     measured_alpha, measured_gamma, computed_alpha, computed_gamma
-        Encoder positions, and the angles (43) that the model gives for the same sightings,
-        rad, shape (..., n), n ≥ 2 measurements.
+        Encoder positions, and the angles (43) that the model predicts for the same sightings, rad,
+        shape (..., n), n ≥ 2 measurements.
     azimuth_weight
-        Weights of the azimuth, shape (..., n): equal if the axis itself scatters,
-        cos² α if the measured normals do, whose scatter the azimuth shows magnified.
+        Weights of the azimuth, shape (..., n): equal if the axis itself scatters, or cos² α if the
+        measured normals scatter, because the azimuth magnifies that scatter.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def axis_accuracy(
 def _circular(
     difference: FloatArray, weight: FloatArray, name: str
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the weighted mean of angles along the last axis, and the deviations from the mean."""
+    """Return the weighted mean of angles along the last axis, and their deviations from it."""
     middle = np.arctan2(
         (weight * np.sin(difference)).sum(axis=-1, keepdims=True),
         (weight * np.cos(difference)).sum(axis=-1, keepdims=True),

@@ -1,9 +1,10 @@
-"""Convert a heliostat to the items that its local controller stores; there is no other converter.
+"""Conversion of a heliostat to the items that its local controller stores.
 
 A calibrated `Mechanism` becomes an armature, the constants of two drives and two biases. Together
 with its `Machine` (limits, stow, defocus and the like) these are all that a local controller needs.
-The plant sends these bytes and compares them with the stored ones by CRC-32, and sends again any
-item that differs. Simulated boards are filled with the same bytes.
+There is no other converter. The plant sends these bytes, compares their CRC-32 with the CRC-32 of
+the stored bytes, and resends any item that differs. Simulated boards are filled with the same
+bytes.
 """
 
 import struct
@@ -47,14 +48,14 @@ POSE_ITEMS = frozenset({"armature", "biases", "drive_primary", "drive_secondary"
 
 
 def drive_numbers(drive: Drive) -> tuple[int, tuple[float, ...], float]:
-    """Return kind, ten numbers and bias (rad) of one drive, as `lcu.drives.Drive` takes them.
+    """Return the kind, the ten numbers and the bias (rad) of a drive, for `lcu.drives.Drive`.
 
-    The other numbers absorb a phase of the sag.
+    A phase of the sag is absorbed in the other numbers.
 
     Raises
     ------
     InputError
-        An array of drives.
+        If it is an array of drives.
     """
     if drive.shape:
         raise InputError(f"drive_numbers: drives have the shape {drive.shape}; pass one drive")
@@ -73,14 +74,15 @@ def items_of(mechanism: Mechanism, machine: Machine | None = None) -> dict[str, 
     Parameters
     ----------
     mechanism
-        Calibrated, batch shape (), with two drives.
+        Calibrated mechanism, batch shape (), with two drives.
     machine
-        Its limits and rest positions; None: only the items that calibration changes.
+        Limits and rest positions; None to return only the items that calibration changes.
 
     Raises
     ------
     InputError
-        Not one mechanism with two drives, or items that a local controller would refuse.
+        If ``mechanism`` is not one mechanism with two drives, or a local controller would refuse an
+        item.
     """
     if mechanism.shape or len(mechanism.driven) != 2:
         raise InputError(
@@ -105,9 +107,9 @@ Tables = tuple[FloatArray, FloatArray]
 
 
 def tables_with(items: Mapping[str, bytes], armature: FloatArray, table: FloatArray) -> Tables:
-    """Return the armature (18,) and the drives (2, 19) of a mechanism after items are stored.
+    """Return a mechanism's armature (18,) and drives (2, 19) after items have been stored.
 
-    The inverse of `items_of`, as far as the pose is concerned.
+    This is the inverse of `items_of`, as far as the pose is concerned.
 
     Parameters
     ----------
@@ -153,9 +155,9 @@ def packed(name: str, values: tuple[object, ...]) -> bytes:
     Raises
     ------
     UnknownNameError
-        The journal has no such item.
+        If the journal has no such item.
     InputError
-        Numbers that do not fit the item, or that a local controller would refuse.
+        If the numbers do not fit the item, or a local controller would refuse them.
     """
     if name not in CODES_OF:
         raise UnknownNameError("item of the journal", name, CODES_OF)
@@ -187,7 +189,7 @@ def differing(required: Mapping[str, bytes], stored: Mapping[str, int]) -> tuple
 
 @dataclass
 class Wanted:
-    """Items that each heliostat should store, and those known to differ.
+    """The items that each heliostat should store, and the items known to differ.
 
     Attributes
     ----------
@@ -207,7 +209,7 @@ class Wanted:
         Raises
         ------
         InputError
-            No items, an item that the plant does not set, or one of the wrong length.
+            If there are no items, or an item is not set by the plant or has the wrong length.
         """
         if not items:
             raise InputError(f"{heliostat}: no items; pass at least one, as returned by items_of")
@@ -219,9 +221,9 @@ class Wanted:
                 )
 
     def set(self, heliostat: str, items: Mapping[str, bytes]) -> None:
-        """Add to the wanted items of a heliostat; see `check`.
+        """Add items to the wanted items of a heliostat; see `check`.
 
-        Items whose wanted value changes count as missing until a comparison finds the new value.
+        An item whose wanted value changes counts as missing until a comparison finds the new value.
         """
         self.check(heliostat, items)
         before = self.items.get(heliostat, {})
@@ -231,13 +233,13 @@ class Wanted:
             self.missing[heliostat] = tuple(sorted(changed.union(self.missing.get(heliostat, ()))))
 
     def rest(self, heliostat: str, point: tuple[float, ...]) -> None:
-        """Set the wanted standby point to the one that a heliostat received, if any is wanted."""
+        """Set the wanted standby point, if any, to the point that a heliostat received."""
         items = self.items.get(heliostat, {})
         if "standby" in items:
             items["standby"] = packed("standby", point)
 
     def compare(self, heliostat: str, stored: Mapping[str, int]) -> tuple[str, ...]:
-        """Compare with the checksums that a heliostat reports; return the names that differ."""
+        """Compare with the checksums that a heliostat reports; return the differing items."""
         found = differing(self.items.get(heliostat, {}), stored)
         if found:
             self.missing[heliostat] = found

@@ -16,21 +16,21 @@ Rows = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 #: Points of a safe path, ENU, m.
 Corners = tuple[tuple[float, float, float], ...]
-#: For indices (M,) into K heliostats and points (M, 3), returns the axis angles (M, 2) at which the
-#: beams reach the points, and whether they can reach them, (M,).
+#: Function of indices (M,) into K heliostats and of points (M, 3). It returns the axis angles
+#: (M, 2) at which the beams reach the points, and whether they can reach them, (M,).
 Pose = Callable[[Rows, FloatArray], tuple[FloatArray, Mask]]
 
 
 def safe_paths(
     corners: Sequence[Corners], position: FloatArray, origin: FloatArray, standby: FloatArray
 ) -> tuple[FloatArray, Rows]:
-    """Return the points of beams from the ground to standby: `Motion.way`.
+    """Return the points of beams from the ground to standby, as `Motion.way` does.
 
     Parameters
     ----------
     corners
-        Points that the plant file specifies for each of N heliostats; (): each heliostat finds its
-        own path.
+        Points that the plant file specifies for each of N heliostats; () if each heliostat finds
+        its own path.
     position, origin, standby
         Positions of the heliostats, origins of their beams, and standby points, ENU, m, (N, 3).
 
@@ -66,7 +66,7 @@ def pieces(corners: FloatArray, origin: FloatArray) -> tuple[FloatArray, Rows]:
     Parameters
     ----------
     corners
-        (N, C, 3), m.
+        Corners of the paths, (N, C, 3), m.
     origin
         Origins of the beams, (N, 3), m.
 
@@ -96,10 +96,10 @@ def pieces(corners: FloatArray, origin: FloatArray) -> tuple[FloatArray, Rows]:
 def end_down_the_path(
     pose: Pose, path: FloatArray, place: Rows, begin: FloatArray, defocus: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the points at which DEFOCUS ends for heliostats on their safe paths: `Motion._turn`.
+    """Return the points at which DEFOCUS ends on the safe paths of heliostats.
 
-    A heliostat moves back down its path until an axis has turned through its defocus angle or the
-    beam reaches the ground.
+    The rule is the same as in `lcu.motion.Motion._turn`. A heliostat moves back down its path until
+    an axis has turned through its defocus angle or the beam reaches the ground.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def end_down_the_path(
     path
         Safe paths, (K, P, 3), m.
     place
-        Number of path points below each heliostat's beam, (K,); 0: the beam does not move back.
+        Number of path points below each heliostat's beam, (K,); at 0 the beam does not move back.
     begin, defocus
         Present angles, and defocus angles of the axes, rad, (K, 2).
 
@@ -132,17 +132,18 @@ def end_down_the_path(
 
 
 def offsets(pose: Pose, points: FloatArray, begin: FloatArray, defocus: FloatArray) -> FloatArray:
-    """Return the rotations of the axes where DEFOCUS does not follow the path: `Motion._turn`.
+    """Return the rotations of the axes where DEFOCUS does not follow the path.
 
-    From an aim, the axes turn away from standby. A heliostat that is held turns away from its aim.
+    The rule is the same as in `lcu.motion.Motion._turn`. From an aim, the axes turn away from
+    standby. A heliostat that is held turns away from its aim.
 
     Parameters
     ----------
     pose, begin, defocus
         As for `end_down_the_path`.
     points
-        Standby point of a heliostat that tracks or searches, otherwise its aim, m, (K, 3); NaN:
-        none.
+        Standby point of a heliostat that tracks or searches, otherwise its aim, m, (K, 3); NaN if
+        there is none.
     """
     off, known = np.full_like(begin, np.nan), np.flatnonzero(np.isfinite(points).all(axis=-1))
     if known.size:
@@ -152,7 +153,7 @@ def offsets(pose: Pose, points: FloatArray, begin: FloatArray, defocus: FloatArr
 
 
 def turned(begin: FloatArray, offset: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return angles turned by an offset, in reverse where a stop is near: `Motion._away`.
+    """Return angles turned by an offset, in reverse if a stop is near, as in `Motion._away`.
 
     Parameters
     ----------

@@ -70,7 +70,7 @@ class Jacobian(Value, Framed):
     pose
         Normal and vertex.
     names
-        The P parameters, in order.
+        Names of the P parameters, in order.
     normal, vertex
         Derivatives with respect to the parameters, shape (..., P, 3), per rad, m or 1.
     normal_counts, vertex_counts
@@ -110,11 +110,11 @@ class Jacobian(Value, Framed):
 
 @runtime_checkable
 class Calibrated(Protocol):
-    """Parameter deviations from a nominal mechanism, taken from a fit, a record or a file."""
+    """Parameter deviations from a nominal mechanism, as found in a fit, a record or a file."""
 
     @property
     def parameters(self) -> Mapping[str, npt.ArrayLike]:
-        """Deviations by name, rad, m or 1, each () or (N,)."""
+        """Deviations by parameter name, in rad, m or 1, each of shape () or (N,)."""
 
     @property
     def heliostats(self) -> tuple[str, ...]:
@@ -122,7 +122,7 @@ class Calibrated(Protocol):
 
 
 def check_calibration(calibration: object) -> None:
-    """Raise an error if a value holds no parameter deviations.
+    """Raise an error if a value does not contain parameter deviations.
 
     Raises
     ------
@@ -159,7 +159,7 @@ class Mechanism(Value, Framed):
     angles
         Fixed part of each joint angle, rad, (..., J).
     drives
-        Batch shape (..., D).
+        Drives, batch shape (..., D).
     vertex, normal
         Mirror vertex (m) and unit normal in the mirror frame, (..., 3).
     deviations
@@ -245,7 +245,7 @@ class Mechanism(Value, Framed):
         return self.shape[0]
 
     def __getitem__(self, index: Index) -> "Mechanism":
-        """Return the mechanisms at ``index`` of the batch axes; None adds an axis."""
+        """Return the mechanisms at ``index`` of the batch axes; an index None adds an axis."""
         if not self.shape and index is not None:
             raise InputError("a single mechanism cannot be indexed")
         return replace(
@@ -273,7 +273,7 @@ class Mechanism(Value, Framed):
         return table
 
     def parameter(self, name: str) -> Parameter:
-        """Return the table entry of parameter ``name``.
+        """Return the table entry of the parameter ``name``.
 
         Raises
         ------
@@ -348,7 +348,7 @@ class Mechanism(Value, Framed):
         Raises
         ------
         InputError
-            If it is not a calibration, or holds a different number of heliostats.
+            If the value is not a calibration, or contains a different number of heliostats.
         UnknownNameError
             If this kind of mechanism lacks one of its parameters.
         """
@@ -366,7 +366,7 @@ class Mechanism(Value, Framed):
         return self.with_parameters(moved)
 
     def most(self, name: str) -> float:
-        """Return the largest allowed deviation of a parameter in either direction, rad, m or 1."""
+        """Return a parameter's largest allowed deviation in either direction, in rad, m or 1."""
         row = self.parameter(name)
         if row.unit != "rad":
             return _FARTHEST if row.unit == "m" else _LARGEST
@@ -396,7 +396,8 @@ class Mechanism(Value, Framed):
         Parameters
         ----------
         counts
-            Shape (..., D); batch axes broadcast against the mechanism's.
+            Drive counts, shape (..., D); their batch axes broadcast against the mechanism's batch
+            axes.
         """
         flat, rows, shape = self._flatten(counts)
         normal, vertex = np.empty((len(rows), 3)), np.empty((len(rows), 3))
@@ -405,20 +406,21 @@ class Mechanism(Value, Framed):
         return Pose(normal.reshape(*shape, 3), vertex.reshape(*shape, 3))
 
     def jacobian(self, counts: npt.ArrayLike, names: tuple[str, ...]) -> Jacobian:
-        """Return the pose and its derivatives by the parameters ``names`` and by the counts.
+        """Return the pose and its derivatives with respect to parameters and counts.
 
         Parameters
         ----------
         counts
-            Shape (..., D); batch axes broadcast against the mechanism's.
+            Drive counts, shape (..., D); their batch axes broadcast against the mechanism's batch
+            axes.
         names
-            P parameters of the table.
+            Names of P parameters of the table.
 
         Notes
         -----
-        This is the screw formula: rotating a joint by a small angle moves the normal by w × n and
-        the vertex by w × (m − o). The formula is exact wherever the chain itself is differentiable,
-        that is, in every pose except that of a fully extended jack.
+        This is the screw formula: rotating a joint by a small angle changes the normal at the rate
+        w × n and the vertex at the rate w × (m − o). The formula is exact wherever the chain itself
+        is differentiable, that is, in every pose except that of a fully extended jack.
         """
         flat, rows, shape = self._flatten(counts)
         codes = self.codes(names)
@@ -457,12 +459,12 @@ class Mechanism(Value, Framed):
 
     @cached_property
     def attachment(self) -> FloatArray:
-        """Transform from the heliostat frame to ENU, for points fixed to the mirror, (..., 4, 4).
+        """Transform from the heliostat frame to ENU for points fixed to the mirror, (..., 4, 4).
 
-        It maps a point that is specified in the heliostat frame at zero joint angles of the
-        mechanism as designed. It combines ``position`` and ``orientation`` (Grigoriev et al. 2021,
-        (5)) with the displacement caused by all deviations between the foot and the last driven
-        joint, because that joint carries the point.
+        The transform maps a point that is specified in the heliostat frame at zero joint angles of
+        the mechanism as designed. The transform combines ``position`` and ``orientation``
+        (Grigoriev et al. 2021, (5)) with the displacement caused by all deviations between the foot
+        and the last driven joint, because that joint carries the point.
         """
         designed = self.with_parameters({name: -v for name, v in self.deviations.items()})
         frame = _transformation(designed.orientation, designed.position)
@@ -472,7 +474,7 @@ class Mechanism(Value, Framed):
 
     @cached_property
     def kernel_arrays(self) -> tuple[np.ndarray, ...]:
-        """The arrays that the compiled kernels read, with one batch axis (N, …)."""
+        """The arrays that the compiled kernels read, with a single batch axis (N, …)."""
         joints, drives = len(self.joints), len(self.driven)
 
         def flat(array: FloatArray, *tail: int) -> FloatArray:
@@ -493,7 +495,7 @@ class Mechanism(Value, Framed):
     def _flatten(
         self, counts: npt.ArrayLike
     ) -> tuple[FloatArray, npt.NDArray[np.intp], tuple[int, ...]]:
-        """Return counts (M, D), the mechanism's row of each, and the batch shape."""
+        """Return counts (M, D), the mechanism index of each row, (M,), and the batch shape."""
         array, drives = as_numbers(counts, "counts"), len(self.driven)
         if array.ndim == 0 or array.shape[-1] != drives:
             raise InputError(
@@ -514,14 +516,17 @@ class Mechanism(Value, Framed):
 
 
 def _transformation(turned: FloatArray, at: FloatArray) -> FloatArray:
-    """Return rotations (..., 3, 3) and points (..., 3) as one matrix each, (..., 4, 4)."""
+    """Return rotations (..., 3, 3) and points (..., 3) combined into matrices (..., 4, 4)."""
     frame = np.zeros((*at.shape[:-1], 4, 4))
     frame[..., :3, :3], frame[..., :3, 3], frame[..., 3, 3] = turned, at, 1.0
     return frame
 
 
 def _carrier(mechanism: Mechanism) -> FloatArray:
-    """Return the frame beyond the last driven joint at zero joint angles, to ENU, (..., 4, 4)."""
+    """Return the transform to ENU from the frame beyond the last driven joint, (..., 4, 4).
+
+    It holds at zero joint angles.
+    """
     turned, at = mechanism.orientation, mechanism.position
     for j in range(max(mechanism.driven) + 1):
         at = at + np.einsum("...ij,...j->...i", turned, mechanism.origins[..., j, :])
@@ -530,7 +535,7 @@ def _carrier(mechanism: Mechanism) -> FloatArray:
 
 
 def join_mechanisms(parts: Sequence[Mechanism]) -> Mechanism:
-    """Join mechanisms of one kind, each of batch shape (n,), into one of shape (N,).
+    """Join mechanisms of one kind, each of batch shape (n,), into an array of shape (N,).
 
     Raises
     ------

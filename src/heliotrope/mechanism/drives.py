@@ -66,7 +66,7 @@ class Drive(Value, Framed):
         return Labelled(tuple(rows), rows, self.variables(tuple(rows)))
 
     def variables(self, axes: tuple[str, ...]) -> dict[str, Variable]:
-        """Return the constants for a data frame, by name; ``axes`` names the batch axes."""
+        """Return the constants by name for a data frame; ``axes`` names the batch axes."""
         table = self.table if self.shape else self.table[None]
         rotary = table[..., slot.KIND] == slot.ROTARY
         variables = {"kind": Variable(axes, np.where(rotary, "rotary", "jack"))}
@@ -77,7 +77,7 @@ class Drive(Value, Framed):
 
     @property
     def kinds(self) -> str:
-        """The kinds of drive present: "rotary", "jack" or "rotary and jack"."""
+        """The kinds of drives present: "rotary", "jack" or "rotary and jack"."""
         codes = self.table[..., slot.KIND]
         names = {"rotary": slot.ROTARY, "jack": slot.LINEAR}
         return " and ".join(name for name, kind in names.items() if (codes == kind).any())
@@ -102,23 +102,23 @@ class Drive(Value, Framed):
         return self.table.shape[:-1]
 
     def __getitem__(self, index: int) -> "Drive":
-        """Return drive ``index`` of the last batch axis."""
+        """Return the drive at ``index`` of the last batch axis."""
         return Drive(self.table[..., index, :])
 
     def angles(self, counts: npt.ArrayLike) -> FloatArray:
-        """Return the joint angle in radians at the given motor counts, both of shape (...)."""
+        """Return the joint angles in radians at given motor counts, both of shape (...)."""
         return self._run(angles_block, counts, "counts")
 
     def counts(self, angles: npt.ArrayLike) -> FloatArray:
         """Return the counts (real numbers) at joint angles in radians, both of shape (...).
 
-        Exact to 1e-9 rad with all periodic terms included. For an angle beyond the reach of a jack,
-        the counts are those of the end of its travel.
+        The result is exact to 1e-9 rad, with all periodic terms included. For an angle beyond the
+        reach of a jack, the result is the counts at the end of its travel.
         """
         return self._run(counts_block, angles, "angles")
 
     def radians_per_count(self, counts: npt.ArrayLike) -> FloatArray:
-        """Return dθ/dcounts, shape (...)."""
+        """Return the derivative dθ/dcounts, shape (...)."""
         return self._run(slopes_block, counts, "counts")
 
     def replace(self, **values: npt.ArrayLike) -> "Drive":
@@ -194,7 +194,7 @@ _UNITS = {
     "rate": "rad or m",
     "speed": "1/s",
 }
-#: Name of each number for errors.
+#: Name of each number in error messages.
 _NAMES = {index: name for name, index in SLOTS.items()} | {
     slot.KIND: "kind",
     slot.SENSE: "sense",
@@ -210,7 +210,10 @@ _STOPS = ("min_angle", "max_angle")
 
 
 def _number(value: npt.ArrayLike, name: str) -> FloatArray:
-    """Return a checked drive constant; angles must be in radians, stops may be infinite."""
+    """Return a checked drive constant.
+
+    Angles must be in radians; stops may be infinite.
+    """
     if name in _ANGLES:
         return as_angles(value, f"drive: {name}", MOST_TURNS)
     number = as_numbers(value, f"drive: {name}")
@@ -238,7 +241,7 @@ def _build(kind: float, numbers: dict[int, npt.ArrayLike]) -> Drive:
 
 
 def _checked(drive: Drive) -> Drive:
-    """Return the drive if its numbers describe one that can move.
+    """Return the drive if its numbers describe a drive that can move.
 
     Raises
     ------
@@ -296,7 +299,7 @@ def _check_monotone(t: FloatArray) -> None:
 
 
 def direct(**values: npt.ArrayLike) -> Drive:
-    """Return a drive whose counts are the joint angle itself, in radians."""
+    """Return a drive whose counts are the joint angle itself in radians."""
     return _build(slot.ROTARY, {slot.RATE: 1.0}).replace(**values)
 
 
@@ -324,12 +327,13 @@ def rotary(
     sense
         +1 if the angle increases with the counts, −1 if it decreases.
     values
-        Any of ``SLOTS``: bias, scale, worm_cos, worm_sin, worm_ratio, sag, stops, speed.
+        Any further constants of ``SLOTS``: bias, scale, worm_cos, worm_sin, worm_ratio, sag, stops,
+        speed.
 
     Raises
     ------
     InputError
-        If no drive with these constants could move.
+        If a drive with these constants could not move.
     """
     steps, micro = (
         as_numbers(steps_per_turn, "steps_per_turn"),
@@ -356,7 +360,7 @@ def linear_paint(
     clockwise: npt.ArrayLike = 1,
     **values: npt.ArrayLike,
 ) -> Drive:
-    """Return a jack from the constants in PAINT's heliostat properties.
+    """Return a linear drive (jack) from the constants in PAINT's heliostat properties.
 
     Parameters
     ----------
@@ -371,7 +375,7 @@ def linear_paint(
     clockwise
         σ = +1 where ``clockwise_axis_movement`` is 1, else −1.
     values
-        Any of ``SLOTS``.
+        Any further constants of ``SLOTS``.
     """
     counts_per_metre = as_numbers(increment, "increment")
     if not (np.isfinite(counts_per_metre) & (counts_per_metre != 0)).all():
@@ -402,7 +406,7 @@ def linear_grigoriev(
     sense: npt.ArrayLike = 1,
     **values: npt.ArrayLike,
 ) -> Drive:
-    """Return a jack from the law of cosines, θ = angle_zero + sense · Φ(L).
+    """Return a linear drive (jack) that follows θ = angle_zero + sense · Φ(L).
 
     Parameters
     ----------
@@ -417,7 +421,7 @@ def linear_grigoriev(
     sense
         +1 if the angle increases with the length.
     values
-        Any of ``SLOTS``.
+        Any further constants of ``SLOTS``.
 
     Notes
     -----
@@ -466,7 +470,7 @@ def linear_guo(
     metres_per_count
         Change in screw length per count, m; Guo's x is this value times the counts.
     values
-        Any of ``SLOTS``.
+        Any further constants of ``SLOTS``.
 
     Notes
     -----

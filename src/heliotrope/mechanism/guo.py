@@ -68,7 +68,7 @@ class GuoParameters:
         ψ_t, angle of the azimuth axis from the vertical, and ψ_a, azimuth towards which
         it leans, rad.
     azimuth_zero, elevation_zero
-        γ₀ and α₀, rad: measured minus true angle, (44) and (46), so joint angle = drive
+        γ₀ and α₀, rad: measured minus true angle, (44) and (46), so that joint angle = drive
         position − zero. Our ``azimuth_bias`` and ``elevation_bias`` have the opposite sign.
     tau_1
         τ₁, angle by which the right-hand end of the elevation axis (looking the way the
@@ -113,7 +113,7 @@ class GuoParameters:
 
 @dataclass(frozen=True, eq=False)
 class MirrorNormal:
-    """The normal that the sun and the target demand.
+    """The normal that the sun and the target require.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class MirrorNormal:
 
 @dataclass(frozen=True, eq=False)
 class GuoTracking:
-    """Drive positions for a demanded normal, on both branches.
+    """Drive positions for a required normal, on both branches.
 
     Attributes
     ----------
@@ -142,10 +142,11 @@ class GuoTracking:
     gamma
         Azimuth drive in [0, 2π), rad, shape (..., 2).
     normal
-        The demanded unit normals in ENU, shape (..., 3).
+        The required unit normals in ENU, shape (..., 3).
     residual, reachable
-        Angle between the demanded normal and the normal at the drive positions, rad, the larger of
-        the two branches (a tracking error); and whether this is at most `REACHED`, shape (...).
+        Angle between the required normal and the normal at the drive positions, rad, for the worse
+        of the two branches (a tracking error); and whether this angle is at most `REACHED`; each of
+        shape (...).
     """
 
     alpha: FloatArray
@@ -156,7 +157,7 @@ class GuoTracking:
 
     @property
     def status(self) -> npt.NDArray[np.str_]:
-        """Return "ok" or "unreachable", shape (...)."""
+        """Return "ok" or "unreachable", in an array of shape (...)."""
         return np.where(self.reachable, "ok", "unreachable")
 
 
@@ -167,12 +168,12 @@ def mirror_normal(
     *,
     exact: bool = False,
 ) -> MirrorNormal:
-    """Return the normal that sends the sun to the target from a mirror off its pivot.
+    """Return the normal with which a mirror in front of its pivot sends the sun to the target.
 
-    Validity: |offset| below the distance. With h = offset / distance the error of (5) is
-    below h⁴/40 rad up to h = 1/2, so 4e-9 rad for 0.5 m at 25 m; the exact form leaves
-    1e-15 rad up to h = 0.99. There is no division by sin θ: retroreflection (θ = 0) is
-    an ordinary case. Source: Guo (5), and (26) divided by cos τ.
+    Validity: |offset| below the distance. With h = offset / distance, the error of (5) is below
+    h⁴/40 rad up to h = 1/2, that is, 4e-9 rad for 0.5 m at 25 m; the error of the exact form is
+    1e-15 rad up to h = 0.99. There is no division by sin θ, so retroreflection (θ = 0) is an
+    ordinary case. Source: Guo (5), and (26) divided by cos τ.
 
     Parameters
     ----------
@@ -183,7 +184,7 @@ def mirror_normal(
     offset
         H_z, m, shape (...).
     exact
-        Solve for τ exactly instead of by Guo's (5).
+        Whether to solve for τ exactly instead of with Guo's (5).
 
     Raises
     ------
@@ -220,8 +221,8 @@ def _offset_slope(
 ) -> FloatArray:
     """Return q = tan τ / sin θ for h = offset / distance.
 
-    The triangle of pivot, vertex and target gives sin 2τ = h sin(θ + τ), and divided by
-    cos τ: 2 sin τ = h (sin θ + cos θ tan τ). Guo's (5) replaces tan τ by sin τ.
+    The triangle of pivot, vertex and target yields sin 2τ = h sin(θ + τ). Divided by cos τ, this
+    becomes 2 sin τ = h (sin θ + cos θ tan τ). Guo's (5) replaces tan τ with sin τ.
     """
     p = h / (2.0 - h * cos_theta)
     q = p / np.sqrt(1.0 - (p * sin_theta) ** 2)
@@ -233,14 +234,14 @@ def _offset_slope(
 
 
 def forward(alpha: npt.ArrayLike, gamma: npt.ArrayLike, parameters: GuoParameters) -> FloatArray:
-    """Return the unit normals (..., 3) in ENU at drive positions, to 1e-15, Guo (29).
+    """Return the unit normals in ENU at drive positions, (..., 3), by Guo's (29), to 1e-15.
 
     Parameters
     ----------
     alpha, gamma
         Elevation and azimuth drive, rad, shape (...).
     parameters
-        Shapes that broadcast against (...).
+        Parameters with shapes that broadcast against (...).
 
     Raises
     ------
@@ -262,20 +263,20 @@ def forward(alpha: npt.ArrayLike, gamma: npt.ArrayLike, parameters: GuoParameter
 def angles(normal: npt.ArrayLike, parameters: GuoParameters) -> GuoTracking:
     """Return the drive positions at which the mirror has a given normal, on both branches.
 
-    A normal in a dead cone, closer than |μ − τ₁| to the azimuth axis or than |μ + τ₁| to
-    its foot, yields the nearest pose and its residual. If the normal lies along the azimuth axis,
-    so that any azimuth will do, the azimuth joint is at 0.
+    A normal in a dead cone, closer than |μ − τ₁| to the azimuth axis or than |μ + τ₁| to its foot,
+    yields the nearest pose and its residual. If the normal is parallel to the azimuth axis, so that
+    any azimuth would do, the azimuth joint is at 0.
 
-    Accuracy: the residual is below 1e-14 rad everywhere, at the keyhole too, where α by
-    arcsin would leave 1e-8 rad. Source: the part of Guo (1)-(28) that leads from the
-    normal to the angles, with (19) in half angles and (22) by atan2.
+    Accuracy: the residual is below 1e-14 rad everywhere, even at the keyhole, where computing α
+    with arcsin would leave 1e-8 rad. Source: the part of Guo (1)-(28) that leads from the normal to
+    the angles, with (19) in half angles and (22) computed with atan2.
 
     Parameters
     ----------
     normal
         Vectors in ENU of any length, shape (..., 3).
     parameters
-        Shapes that broadcast against (...).
+        Parameters with shapes that broadcast against (...).
 
     Raises
     ------
@@ -313,9 +314,9 @@ def angles(normal: npt.ArrayLike, parameters: GuoParameters) -> GuoTracking:
 def _co_elevation(c: FloatArray, tau_1: FloatArray, mu: FloatArray) -> FloatArray:
     """Return β = π/2 − α in [0, π] for normals c in the tilted frame.
 
-    sin α = (cos ζ − sin μ sin τ₁) / (cos μ cos τ₁), ζ the angle from the azimuth axis.
-    Then tan²(β/2) = (1 − sin α) / (1 + sin α), where both differences are products:
-    cos(μ − τ₁) − cos ζ above and cos(μ + τ₁) + cos ζ below. Where a product is negative, the normal
+    sin α = (cos ζ − sin μ sin τ₁) / (cos μ cos τ₁), where ζ is the angle from the azimuth axis.
+    Then tan²(β/2) = (1 − sin α) / (1 + sin α), with numerator and denominator written as products:
+    cos(μ − τ₁) − cos ζ above and cos(μ + τ₁) + cos ζ below. If a product is negative, the normal
     lies in a dead cone; clamping the product yields the nearest pose.
     """
     zeta = np.arctan2(np.hypot(c[..., 0], c[..., 1]), c[..., 2])
@@ -328,7 +329,7 @@ def _co_elevation(c: FloatArray, tau_1: FloatArray, mu: FloatArray) -> FloatArra
 
 
 def _azimuth(c: FloatArray, beta: FloatArray, tau_1: FloatArray, mu: FloatArray) -> FloatArray:
-    """Return the azimuth joint angle that turns the normal (x, y) at azimuth 0 onto c."""
+    """Return the azimuth joint angle that rotates the normal (x, y) at azimuth 0 onto c."""
     x = np.sin(mu) * np.cos(tau_1) - np.cos(mu) * np.sin(tau_1) * np.cos(beta)
     y = np.cos(mu) * np.sin(beta)
     east = c[..., 0] * y - c[..., 1] * x
@@ -341,7 +342,7 @@ def _azimuth(c: FloatArray, beta: FloatArray, tau_1: FloatArray, mu: FloatArray)
 def track(
     to_target: npt.ArrayLike, sun: npt.ArrayLike, parameters: GuoParameters, *, exact: bool = False
 ) -> GuoTracking:
-    """Return the drive positions that reflect the sun to the target, by Guo's formula.
+    """Return the drive positions that reflect the sun to the target by Guo's formula.
 
     For validity, accuracy and source see `mirror_normal` and `angles`. Stops are ignored.
 
@@ -365,16 +366,16 @@ def track(
 def regularise(parameters: GuoParameters) -> GuoParameters:
     """Return the same mechanism with its parameters in their natural ranges.
 
-    A fit may end at any of the equivalent parameter sets. The returned set has ψ_t in [0, π/2] (in
-    (π/2, π] only if the azimuth axis points below the horizon, which no relation can
-    raise), ψ_a in [0, 2π), γ₀ in [−π, π), τ₁ and α₀ in [−π/2, π/2]; ψ_a is 0 where there
-    is no tilt. μ lies in [−π/2, π/2] as well unless cos τ₁ cos μ cos α₀ < 0: no relation
-    changes the sign of this product, so one of the three must then lie beyond, and μ does.
-    `forward` is the same to 1e-14 for every drive position. Values already in their ranges
-    are not touched, so a second call changes nothing.
+    A fit may end at any of several equivalent parameter sets. The returned set has ψ_t in [0, π/2]
+    (in (π/2, π] only if the azimuth axis points below the horizon, which no relation can raise),
+    ψ_a in [0, 2π), γ₀ in [−π, π), τ₁ and α₀ in [−π/2, π/2]; ψ_a is 0 if there is no tilt. μ lies in
+    [−π/2, π/2] as well unless cos τ₁ cos μ cos α₀ < 0. No relation changes the sign of this
+    product, so one of the three angles must then lie outside its range; μ is chosen. The result of
+    `forward` stays the same to 1e-14 for every drive position. Values already in their ranges are
+    not changed, so a second call changes nothing.
 
-    Source: Guo (31)-(37), (39) and (40). His ranges are "for example" 0 to 360° for γ₀,
-    ψ_t and ψ_a; ours for γ₀ is ±180°, so that a zero of −6 mrad reads as such.
+    Source: Guo (31)-(37), (39) and (40). Guo's ranges are "for example" 0 to 360° for γ₀, ψ_t and
+    ψ_a; our range for γ₀ is ±180°, so that a zero of −6 mrad is displayed as −6 mrad.
     """
     p = parameters
     tilt = _wrap(p.tilt)
@@ -398,23 +399,23 @@ def regularise(parameters: GuoParameters) -> GuoParameters:
 
 
 def _wrap(angle: npt.ArrayLike) -> FloatArray:
-    """Return the angle in [−π, π), bit for bit where it is there already."""
+    """Return the angle in [−π, π), unchanged to the last bit if it already lies there."""
     a = as_float(angle)
     return as_float(np.where((a >= -np.pi) & (a < np.pi), a, wrap_signed(a)))
 
 
 def _fold(angle: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Return π − angle (modulo 2π) where |angle| > π/2, and where that is."""
+    """Return π − angle (modulo 2π) where |angle| > π/2, and a mask of these places."""
     folded = np.abs(angle) > 0.5 * np.pi
     return as_float(np.where(folded, np.copysign(np.pi, angle) - angle, angle)), folded
 
 
 def to_heliotrope(parameters: GuoParameters) -> dict[str, FloatArray]:
-    """Return the parameters of our azimuth-elevation chain that make the same machine.
+    """Return the parameters with which our azimuth-elevation chain is the same mechanism.
 
-    Exact to 1e-15. Both descriptions of the tilt put the axis in the same place but
-    differ by a turn about it, tilt_north · tilt_east / 2 to second order, which goes
-    into ``azimuth_bias``.
+    The conversion is exact to 1e-15. Both descriptions of the tilt place the axis identically but
+    differ by a rotation about it, tilt_north · tilt_east / 2 to second order, which is added to
+    ``azimuth_bias``.
 
     Returns
     -------
@@ -441,13 +442,13 @@ def to_heliotrope(parameters: GuoParameters) -> dict[str, FloatArray]:
 def from_heliotrope(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
     """Return Guo's parameters of our azimuth-elevation chain.
 
-    The inverse of `to_heliotrope` up to the relations of `regularise`; the
-    tilt comes out in [0, π]. Exact to 1e-15.
+    This is the inverse of `to_heliotrope`, up to the relations of `regularise`; the returned tilt
+    lies in [0, π]. The conversion is exact to 1e-15.
 
     Parameters
     ----------
     values
-        Any of the names that `to_heliotrope` gives; the others are 0.
+        Values for any of the names that `to_heliotrope` returns; missing values are 0.
 
     Raises
     ------
@@ -476,14 +477,15 @@ def from_heliotrope(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
 
 
 def to_malan(parameters: GuoParameters) -> dict[str, FloatArray]:
-    """Return Malan's ``eptN``, ``eptE``, ``gb``, ``ab`` and ``eNO``, rad, shape (...).
+    """Return Malan's ``eptN``, ``eptE``, ``gb``, ``ab`` and ``eNO``, rad, each (...).
 
-    Exact: with the misprints of (4.7)-(4.17) resolved, Malan's order of turns is ours.
+    The conversion is exact: once the misprints of (4.7)-(4.17) are resolved, Malan's order of
+    rotations is the same as ours.
 
     Raises
     ------
     InputError
-        If μ or the offset is not 0: Malan's model has neither.
+        If μ or the offset is not 0, because Malan's model has neither.
     """
     ours = to_heliotrope(parameters)
     for name, unit in (("canting", "rad"), ("pivot_offset", "m")):
@@ -495,7 +497,7 @@ def to_malan(parameters: GuoParameters) -> dict[str, FloatArray]:
 
 
 def from_malan(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
-    """Return Guo's parameters from any of Malan's (rad), the missing ones being 0.
+    """Return Guo's parameters from any of Malan's parameters (rad); missing values are 0.
 
     Raises
     ------
@@ -509,7 +511,7 @@ def from_malan(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
 
 
 def _tilt_rotation(tilt: FloatArray, tilt_azimuth: FloatArray) -> FloatArray:
-    """Return the rotation by ψ_t that leans the vertical towards the azimuth ψ_a."""
+    """Return the rotation by ψ_t that tilts the vertical towards the azimuth ψ_a."""
     # About U × d for the horizontal direction d at azimuth ψ_a.
     return rotation(direction(tilt_azimuth - 0.5 * np.pi, 0.0), tilt)
 
@@ -517,7 +519,7 @@ def _tilt_rotation(tilt: FloatArray, tilt_azimuth: FloatArray) -> FloatArray:
 def _twist(
     tilt: FloatArray, tilt_azimuth: FloatArray, tilt_north: FloatArray, tilt_east: FloatArray
 ) -> FloatArray:
-    """Return the angle w with R_guo = R_ours R_U(w), both leaning the vertical alike."""
+    """Return the angle w in R_guo = R_ours R_U(w), where both rotations tilt the vertical alike."""
     guo = _tilt_rotation(tilt, tilt_azimuth)
     ours = rotation([-1.0, 0.0, 0.0], tilt_north) @ rotation([0.0, 1.0, 0.0], tilt_east)
     turn = np.swapaxes(ours, -1, -2) @ guo
@@ -525,7 +527,7 @@ def _twist(
 
 
 def numbers(value: npt.ArrayLike, name: str) -> FloatArray:
-    """Return ``value`` as an array of finite numbers; an error names it."""
+    """Return ``value`` as an array of finite numbers; an error message contains its name."""
     try:
         array = as_float(value)
     except (TypeError, ValueError):
@@ -537,7 +539,7 @@ def numbers(value: npt.ArrayLike, name: str) -> FloatArray:
 def refuse(
     invalid: npt.NDArray[np.bool_], what: str, problem: Callable[[tuple[int, ...]], str]
 ) -> None:
-    """Raise for the first place where ``invalid`` holds, naming it."""
+    """Raise an error that names the first place where ``invalid`` is True."""
     if np.any(invalid):
         i = tuple(int(k) for k in np.argwhere(invalid)[0])
         raise InputError(f"{what}{list(i) if i else ''}: {problem(i)}")

@@ -1,6 +1,6 @@
-"""Conversion between Guo's parameters (his names and units) and those of a mechanism.
+"""Conversion between Guo's parameters, in his names and units, and a mechanism's parameters.
 
-Guo's six angles are ψ_a, ψ_t, γ₀, τ₁, α₀, μ, in degrees; his H_z is in metres.
+Guo's six angles are ψ_a, ψ_t, γ₀, τ₁, α₀ and μ, in degrees; his H_z is in metres.
 """
 
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ _ONE_NORMAL, _ONE_POINT = 1e-9, 1e-6
 
 
 def in_his_names(parameters: GuoParameters) -> dict[str, FloatArray]:
-    """Return the parameters by `NAMES`, degrees and metres, in the ranges of `regularise`."""
+    """Return the parameters by `NAMES`, in degrees and m, within the ranges of `regularise`."""
     p = regularise(parameters)
     return {
         name: getattr(p, ours) if unit == "m" else as_float(np.degrees(getattr(p, ours)))
@@ -42,12 +42,12 @@ def in_his_names(parameters: GuoParameters) -> dict[str, FloatArray]:
 
 
 def from_his_names(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
-    """Return Guo's parameters from any of `NAMES`, in degrees and metres; the others are 0.
+    """Return Guo's parameters from values for any of `NAMES`, in degrees and metres.
 
     Raises
     ------
     InputError
-        If he has no such name, or a value is not finite.
+        If Guo's model has no such name, or a value is not finite.
     """
     parameters = {}
     for name, value in values.items():
@@ -59,16 +59,16 @@ def from_his_names(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
 
 
 def of_mechanism(mechanism: Mechanism, *, zeros: bool = False) -> tuple[GuoParameters, FloatArray]:
-    """Return Guo's parameters of azimuth-elevation mechanisms, and their pivots.
+    """Return Guo's parameters of azimuth-elevation mechanisms, and the mechanisms' pivots.
 
     Parameters
     ----------
     mechanism
-        Batch shape (...).
+        Mechanisms, batch shape (...).
     zeros
-        Whether γ₀ and α₀ are those of the drives, for drives without an error other than
-        their bias. Otherwise they are 0: his γ and α are then the joints' angles, which the
-        drives turn into counts with all that is imperfect in them.
+        Whether γ₀ and α₀ are the zeros of the drives, for drives without any error except their
+        bias. Otherwise they are 0: Guo's γ and α are then the joint angles, which the drives
+        convert into counts with all their imperfections.
 
     Returns
     -------
@@ -77,8 +77,8 @@ def of_mechanism(mechanism: Mechanism, *, zeros: bool = False) -> tuple[GuoParam
     Raises
     ------
     InputError
-        If the mechanism is of another kind, or has features outside the formula: axes that
-        do not meet, a vertex beside the normal through that point, a foundation that is turned.
+        If the mechanism is of another kind, or has features outside the formula: axes that do not
+        meet, a vertex beside the normal through that point, or a rotated foundation.
     """
     if mechanism.kind != "azimuth_elevation":
         raise InputError(

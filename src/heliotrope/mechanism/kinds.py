@@ -34,7 +34,7 @@ from heliotrope.mechanism.parameters import Parameter
 
 EAST, NORTH, UP = np.eye(3)
 _LEANS = {"east": EAST, "north": NORTH, "up": UP}
-#: Longest distance within a heliostat, m: millimetres are mostly larger.
+#: Longest distance within a heliostat, m; a number in millimetres is mostly larger.
 _LONGEST = 1000.0
 
 
@@ -76,9 +76,9 @@ def two_axis(
     origin_2
         Point on the secondary axis, relative to ``origin_1``, m.
     arm
-        From ``origin_2`` to the point about which canting rotates the mirror, m.
+        Vector from ``origin_2`` to the point about which canting rotates the mirror, m.
     vertex
-        From that point to the mirror vertex, m; it rotates with the canting.
+        Vector from that point to the mirror vertex, m; it rotates with the canting.
     orientation
         Rotation from the heliostat frame to ENU, (..., 3, 3); default identity.
     drives
@@ -87,10 +87,11 @@ def two_axis(
     Raises
     ------
     InputError
-        If a direction is zero, the axes are parallel, the normal lies along the secondary axis, the
-        orientation is not a rotation, two joints have the same name, or a point is not a vector.
+        If a direction is zero, the axes are parallel, the normal is parallel to the secondary axis,
+        the orientation is not a rotation, two joints have the same name, or a point is not a
+        vector.
     UnknownNameError
-        If the primary axis is said to tilt in an unknown direction.
+        If ``leans`` contains an unknown direction.
     """
     p = as_vectors(position, "position")
     a1, a2 = normalize(axis_1, "axis_1"), normalize(axis_2, "axis_2")
@@ -133,37 +134,38 @@ def with_joint(
     origin: npt.ArrayLike = (0.0, 0.0, 0.0),
     cause: str = "own joint",
 ) -> Mechanism:
-    """Return mechanisms with one more joint that no drive moves, a parameter of the same name.
+    """Return mechanisms with an additional fixed joint and a parameter of the same name.
 
-    Its angle is 0 until `Mechanism.with_parameters` or a fit moves it, so that nothing else
-    changes. Derivatives follow from the screw formula, as for every joint. A plant file keeps the
-    joint, but not its row of the parameter table.
+    No drive moves the joint. Its angle is 0 until `Mechanism.with_parameters` or a fit changes it,
+    so that nothing else changes. Derivatives follow from the screw formula, as for every joint. A
+    plant file keeps the joint, but not its entry in the parameter table.
 
     Parameters
     ----------
     mechanism
-        Shape (...).
+        Mechanisms, shape (...).
     name
-        Unique among joints and parameters.
+        Name of the joint, unique among joints and parameters.
     axis
-        In the frame that the joint ``after`` turns, (..., 3), any length; angles are right-handed
-        about it.
+        Axis of the joint in the frame that the joint ``after`` rotates, (..., 3), any length;
+        angles are right-handed about it.
     prior
         Standard deviation of the angle before any measurement, rad.
     after
-        Joint that it follows on the way from ground to mirror; None: it is the first.
+        Joint that the new joint follows on the way from ground to mirror; None if the new joint is
+        the first.
     origin
         Point on the axis, from the origin of ``after`` or from the position, m, (..., 3).
     cause
-        Physical cause, for the table.
+        Physical cause, for the parameter table.
 
     Raises
     ------
     UnknownNameError
         If there is no joint ``after``.
     InputError
-        If the name is taken, the axis is zero, the prior is no angle above 0, or a shape does not
-        fit.
+        If the name is taken, the axis is zero, the prior is not an angle above 0, or a shape does
+        not fit.
     """
     if after is not None and after not in mechanism.joints:
         raise UnknownNameError(f"joint of a {mechanism.kind} mechanism", after, mechanism.joints)
@@ -189,7 +191,7 @@ def with_joint(
     place = 0 if after is None else mechanism.joints.index(after) + 1
     origins = np.insert(mechanism.origins, place, point, axis=-2)
     vertex = mechanism.vertex.copy()
-    # What follows stays where it is.
+    # The following joints stay where they are.
     if place == len(mechanism.joints):
         vertex -= point
     else:
@@ -269,7 +271,7 @@ def _assemble(
 
 
 def _tables(drives: object, driven: tuple[int, ...]) -> list[FloatArray]:
-    """Return the tables of the drives, one for each driven joint."""
+    """Return the tables of the drives, one table per driven joint."""
     if drives is None:
         return [direct().table for _ in driven]
     drive_list = tuple(drives) if isinstance(drives, tuple | list) else (drives,)
@@ -355,7 +357,7 @@ def tilt_roll(
     pivot_offset: npt.ArrayLike = 0.0,
     drives: tuple[Drive, Drive] | None = None,
 ) -> Mechanism:
-    """Return tilt-roll mechanisms; the first axis (tilt) lies along ``axis``.
+    """Return tilt-roll mechanisms; the first axis (tilt) is parallel to ``axis``.
 
     At zero angles the mirror faces as far up as the first axis allows; the second axis (roll) lies
     in the mirror plane, perpendicular to the first.
@@ -363,7 +365,7 @@ def tilt_roll(
     Parameters
     ----------
     position
-        ENU metres, (..., 3).
+        Foot of the heliostat, ENU metres, (..., 3).
     axis
         Direction of the first axis in ENU, (..., 3); it must not be vertical.
     kind
@@ -441,8 +443,8 @@ def pitch_roll(
 ) -> Mechanism:
     """Return pitch-roll mechanisms; the first axis is horizontal and perpendicular to ``azimuth``.
 
-    At zero angles the mirror faces up. A positive pitch tilts it away from the azimuth (rad) that
-    the heliostat faces; the roll axis lies in the mirror.
+    At zero angles the mirror faces up. A positive pitch tilts the mirror away from the azimuth
+    (rad) that the heliostat faces; the roll axis lies in the mirror.
 
     Raises
     ------
@@ -465,12 +467,12 @@ def pitch_roll(
 def of_armature(
     armature: Armature, drives: Drive, position: npt.ArrayLike, *, kind: str = "two_axis"
 ) -> Mechanism:
-    """Return two-axis mechanisms with given armatures: any kind, without the names of its errors.
+    """Return two-axis mechanisms with given armatures, which may come from any kind.
 
     Parameters
     ----------
     armature
-        Shape (...).
+        Armatures, shape (...).
     drives
         Both drives, (..., 2).
     position
@@ -507,7 +509,7 @@ def polar(
     position
         ENU metres, (..., 3).
     latitude
-        Radians, positive north, (...).
+        Latitude, rad, positive north, (...).
     pivot_height, pivot_offset, drives
         As for `tilt_roll`.
 
@@ -612,7 +614,7 @@ def single_axis(
     Raises
     ------
     InputError
-        If the normal lies along the axis, or the orientation is not a rotation.
+        If the normal is parallel to the axis, or the orientation is not a rotation.
     """
     p, a, n = as_vectors(position, "position"), normalize(axis, "axis"), normalize(normal, "normal")
     if (np.linalg.norm(np.cross(a, n), axis=-1) < 1e-6).any():

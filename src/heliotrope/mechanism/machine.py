@@ -1,7 +1,7 @@
 """Motor settings and rest positions of a heliostat, which calibration does not change.
 
-They come from the plant file (`[groups.NAME.machine]`); `board_items` converts them to the bytes
-that a local controller stores.
+The settings come from the plant file (`[groups.NAME.machine]`); `board_items` converts them to the
+bytes that a local controller stores.
 """
 
 import math
@@ -22,13 +22,13 @@ from heliotrope.lcu.config import (
     Config,
 )
 
-#: Points of the safe way that a local controller can store.
+#: Maximum number of points of the safe path that a local controller can store.
 WAY_POINTS = MOST_POINTS
 #: Highest rate that a local controller emits, steps/s.
 MOST_RATE = 1000 * Config().stride // Config().ahead_ms
 _NAMES = ("primary", "secondary")
-#: Longest turn of a DEFOCUS, s: a beam must be off 30 s after the loss of what leads it, which is
-#: noticed by the end of a lease, 6 s, and the first order may be lost.
+#: Longest duration of a DEFOCUS, s: a beam must be off 30 s after the loss of its controlling
+#: program, which is noticed at the end of a lease, 6 s, and the first order may be lost.
 LONGEST_DEFOCUS = 20.0
 #: Steps in which `spread_defocus` spreads each axis: their product is the number of machines.
 _SPREADS = 8
@@ -43,7 +43,7 @@ class AxisLimits:
     low, high
         End positions, steps.
     rate, acceleration
-        Steps/s and steps/s².
+        Maximum rate, steps/s, and acceleration, steps/s².
     backlash
         Length of the final approach from below, steps.
 
@@ -61,7 +61,7 @@ class AxisLimits:
 
     @property
     def lead(self) -> int:
-        """Lead of a goal that moves down with the sun, steps, as in `lcu.stepper`."""
+        """Lead of a goal that moves down with the sun, in steps; see `lcu.stepper`."""
         return math.ceil(self.backlash / 8)
 
     def __post_init__(self) -> None:
@@ -87,19 +87,19 @@ class AxisLimits:
 
 @dataclass(frozen=True)
 class Stepping:
-    """How the motors' drivers step.
+    """How the motor drivers step.
 
     Attributes
     ----------
     microsteps
-        Microsteps of a full step of each motor.
+        Microsteps per full step of each motor.
     rests
         Whether the drivers are off between motions, which then end on full steps.
 
     Raises
     ------
     InputError
-        Microsteps out of range.
+        If a number of microsteps is out of range.
     """
 
     microsteps: tuple[int, int]
@@ -126,15 +126,15 @@ class Machine:
     defocus
         Angles of both axes for turning away from the receiver, rad.
     standby
-        Standby point, ENU, m; None: the local controller keeps its stored point.
+        Standby point, ENU, m; None if the local controller keeps its stored point.
     azimuth_axis
         Index (0, 1) of the axis that leaves stow first.
     way
         Points through which the beam passes on its way from the ground to the standby point, ENU,
-        m, at most `WAY_POINTS`; (): the local controller finds its own path.
+        m, at most `WAY_POINTS`; () if the local controller finds its own path.
     stepping
-        How the motor drivers step; None: the local controller keeps its stored setting, which
-        initially is to keep the drivers powered.
+        How the motor drivers step; None if the local controller keeps its stored setting, which
+        initially keeps the drivers powered.
     stow_lights
         Whether the beam of the stowed heliostat may cross a receiver or a target at some hours of
         the year; this is the light of a single heliostat. The beam never crosses a keep-out volume.
@@ -192,21 +192,21 @@ class Machine:
 
 
 def spread_defocus(defocus: npt.ArrayLike, names: Sequence[str], spread: float) -> FloatArray:
-    """Return angles of the defocus that differ from mirror to mirror, rad, (N, 2).
+    """Return defocus angles that differ from heliostat to heliostat, rad, (N, 2).
 
-    If all mirrors turned by the same angles, their beams would stay together beside the receiver.
-    Each axis turns by its angle, and by up to ``spread`` times more. How much depends on the name
-    alone, so that a mirror keeps its angles when others are added. `optics.standing.hottest` shows
-    what that is worth.
+    If all heliostats turned by the same angles, their beams would stay together beside the
+    receiver. Each axis therefore turns by its angle plus up to ``spread`` times that angle. The
+    addition depends only on the name, so that a heliostat keeps its angles when other heliostats
+    are added. `optics.standing.hottest` shows the benefit.
 
     Parameters
     ----------
     defocus
         Smallest angles of both axes, rad, (N, 2) or (2,).
     names
-        The N heliostats.
+        Names of the N heliostats.
     spread
-        0 for none.
+        Largest relative increase of an angle; 0 for no spread.
     """
     if spread == 0.0:
         return as_float(np.broadcast_to(as_float(defocus), (len(names), 2)))
@@ -219,9 +219,9 @@ def spread_defocus(defocus: npt.ArrayLike, names: Sequence[str], spread: float) 
 def spread_machines(
     machine: Machine, names: Sequence[str], spread: float = 1.0
 ) -> tuple[Machine, ...]:
-    """Return the machine of each of N heliostats, alike but for the defocus; see `spread_defocus`.
+    """Return machines of N heliostats that differ only in the defocus angles.
 
-    Heliostats with the same angles share one object.
+    See `spread_defocus`. Heliostats with the same angles share one object.
     """
     made: dict[tuple[float, float], Machine] = {}
     machines = []

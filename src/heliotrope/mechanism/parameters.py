@@ -19,7 +19,7 @@ class Parameter:
     Attributes
     ----------
     name
-        Its name, for example ``tilt_north``.
+        Name of the parameter, for example ``tilt_north``.
     unit
         "rad", "m" or "1" (relative).
     cause
@@ -43,7 +43,7 @@ class Parameter:
     code: tuple[int, int, int] = (0, 0, 0)
 
 
-#: Rows that every mechanism has; their code does not depend on the joints.
+#: Entries that every mechanism has; their codes do not depend on the joints.
 _PLACE = (
     Parameter(
         "position_east",
@@ -83,7 +83,7 @@ _PLACE = (
     ),
 )
 
-#: Rows by the name of a fixed joint.
+#: Entries by the name of a fixed joint.
 _JOINTS = {
     row.name: row
     for row in (
@@ -137,7 +137,7 @@ _JOINTS = {
     )
 }
 
-#: Rows of a drive: (suffix, slot, row). The name is "<joint>_<suffix>".
+#: Entries of a drive: (suffix, slot, entry). The name is "<joint>_<suffix>".
 _ANY_DRIVE = (
     (
         "bias",
@@ -263,7 +263,7 @@ def table(
 def _table(
     joints: tuple[str, ...], driven: tuple[int, ...], linear: tuple[bool, ...]
 ) -> dict[str, Parameter]:
-    """As `table`: there are few kinds, and every moved mechanism asks again."""
+    """Return the result of `table` from a cache, because every moved mechanism needs it again."""
     rows = list(_PLACE)
     for index, name in enumerate(joints):
         if name in _JOINTS:
@@ -320,9 +320,9 @@ def model(name: str, known: dict[str, Parameter]) -> tuple[str, ...]:
     Parameters
     ----------
     name
-        A model, a role ("position", "tilts", "biases", "scales", "non_orthogonality", "canting"),
-        a parameter, or several of them joined by "+", such as "malan8+canting". A model written
-        down for azimuth and elevation takes the parameters of the same role in other kinds.
+        A model, a role ("position", "tilts", "biases", "scales", "non_orthogonality", "canting"), a
+        parameter, or several of them joined by "+", such as "malan8+canting". A model defined for
+        azimuth and elevation selects the parameters with the same role in other kinds.
     known
         Parameter table of the mechanism.
 
@@ -348,7 +348,7 @@ def _part(name: str, known: dict[str, Parameter]) -> tuple[str, ...]:
             raise UnknownNameError(
                 f"parameter (of model {name!r}) in this kind of mechanism:", missing[0], known
             )
-        # A mechanism with one axis has no second one to lean.
+        # A mechanism with one axis has no second axis that could lean.
         roles = [role for role in _BY_ROLE[name] if len(_drives(known)) > 1 or role not in _SECOND]
         return tuple(n for role in roles for n in _role(role, known))
     if name in _ROLES:
@@ -385,7 +385,7 @@ def _role(role: str, known: dict[str, Parameter]) -> tuple[str, ...]:
 
 
 def unit_of(name: str) -> str:
-    """Return the unit of a parameter, "" where it has none."""
+    """Return the unit of a parameter; "" if it has none."""
     rows = (*_PLACE, *_JOINTS.values(), _SAG)
     units = {row.name: row.unit for row in rows}
     units |= {suffix: row.unit for suffix, _, row in (*_ANY_DRIVE, *_LINEAR_DRIVE)}
@@ -396,5 +396,5 @@ def unit_of(name: str) -> str:
 
 
 def shown_in(name: str) -> tuple[float, str]:
-    """Return the factor and the unit in which people read a parameter: mrad, mm or none."""
+    """Return the factor and the unit with which a parameter is displayed: mrad, mm or none."""
     return {"rad": (1e3, "mrad"), "m": (1e3, "mm")}.get(unit_of(name), (1.0, ""))

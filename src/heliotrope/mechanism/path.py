@@ -1,9 +1,9 @@
 """A day's tracking as a path: successive drive positions without needless slews.
 
 `track` solves each sun position independently, so two successive solutions may lie on different
-branches, or a revolution apart. A path is the least-cost sequence of solutions, found by dynamic
-programming over branches and revolutions. It minimises, in this order: poses that miss the aim,
-poses over the top, slews, and motion.
+branches, or a revolution apart. A path is the sequence of solutions with the least cost, found by
+dynamic programming over branches and revolutions. The cost minimises, in this order: poses that
+miss the aim, poses over the top, slews, and motion.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.mechanism.tracking import Steered, Tracking, TrackingStatus, track
 from heliotrope.values import Card, Value, amount, span
 
-#: Costs in rad of motion: a pose that misses, one over the top, a slew. Each outweighs all below
-#: it over a day of 10,000 poses.
+#: Costs in rad of motion: a pose that misses the aim, a pose over the top, a slew. Each cost
+#: outweighs all lower costs over a day of 10,000 poses.
 _MISS, _TOP, _SLEW = 1e14, 1e8, 1e3
 #: The keyhole must be this far from the home position for one branch to be over the top, rad.
 _SIDE = 0.1
@@ -30,14 +30,14 @@ _FOLLOWS, _SLACK = 2.0, 1e-6
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Slew(Value):
-    """A step of the path that the motion of the sun does not explain.
+    """A step of the path that the sun's motion does not explain.
 
     Attributes
     ----------
     step
         Index of the pose at which the slew ends.
     row
-        Heliostat index, counted over the batch axes behind the time axis.
+        Heliostat index, counted over all batch axes after the time axis.
     turn
         Change of the joint angles, rad, (D,).
     reason
@@ -75,7 +75,7 @@ class TrackedPath(Value, Framed):
     over_the_top
         Whether the mirror is beyond the keyhole, seen from its home position, (T, ...).
     slews
-        The steps that the motion of the sun does not explain, in order of time.
+        The steps that the sun's motion does not explain, in order of time.
     """
 
     angles: FloatArray
@@ -107,7 +107,7 @@ class TrackedPath(Value, Framed):
         return Labelled(row, labels, self.variables(row))
 
     def variables(self, row: tuple[str, ...]) -> dict[str, Variable]:
-        """Return the arrays for a data frame, by name; ``row`` names the axes (T, ...)."""
+        """Return the arrays by name for a data frame; ``row`` names the axes (T, ...)."""
         return {
             "angle": Variable((*row, "joint"), self.angles, "rad"),
             "count": Variable((*row, "joint"), self.counts),
@@ -139,9 +139,9 @@ def track_path(
     Parameters
     ----------
     mechanism
-        Mechanisms, a heliostat, several heliostats or a plant, batch shape (...).
+        Mechanisms, one or several heliostats, or a plant, batch shape (...).
     sun
-        Unit vectors to the sun, ENU, (T, 3), or (T, ..., 3) that broadcasts to the batch.
+        Unit vectors to the sun, ENU, (T, 3), or (T, ..., 3) if they broadcast to the batch.
     aim, local
         Points in ENU metres, and whether they are fixed to the mirror, as for `track`.
     current
@@ -159,8 +159,8 @@ def track_path(
     -----
     Both joints rotate about fixed axes, so the two branches are mirror images of each other about
     the keyhole, that is, the angle of the second joint at which the normal comes closest to the
-    primary axis. The usual branch is the one on the side of the home position (the middle of the
-    stops, or 0).
+    primary axis. The usual branch is on the side of the home position (the middle of the stops, or
+    0).
     """
     light = as_vectors(sun, "sun")
     batch = mechanism.armature.shape
@@ -214,7 +214,7 @@ def track_path(
 
 
 def _flat(tracking: Tracking) -> Tracking:
-    """Return solutions with one axis of heliostats behind that of time, (T, N, …)."""
+    """Return solutions with one heliostat axis after the time axis, (T, N, …)."""
     batch = tracking.best.ndim
     steps = tracking.best.shape[0]
     return Tracking(
@@ -226,24 +226,24 @@ def _flat(tracking: Tracking) -> Tracking:
 class _Choices:
     """The poses among which a path chooses, for T times and N heliostats.
 
-    A state is a branch with a number of turns of each joint: S in all.
+    A state is a branch with a number of turns of each joint. There are S states in total.
 
     Attributes
     ----------
     table
         Drives, (N, D, slots).
     angles
-        (T, N, 2, D), each joint in the lowest turn that its stops allow.
+        Joint angles, rad, (T, N, 2, D), each in the lowest turn that the joint's stops allow.
     able
-        Whether the branch serves the aim, (T, N, 2).
+        Whether the branch reaches the aim, (T, N, 2).
     top
-        Whether it is over the top, (T, N, 2).
+        Whether the branch is over the top, (T, N, 2).
     free
-        Whether a joint may turn without end, (N, D).
+        Whether a joint may turn without limit, (N, D).
     high
         Upper stop, rad, (N, D).
     turns
-        Branch (0 or 1) and turns of each joint of the S states, (S, 1 + D).
+        Branch (0 or 1) and number of turns of each joint for the S states, (S, 1 + D).
     """
 
     table: FloatArray
@@ -274,7 +274,7 @@ class _Choices:
         return cls(table, angles, able, top, free, np.where(turning, high, np.inf), turns)
 
     def at(self, step: int) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-        """Return the angles of the states at a time, (N, S, D), and which of them exist, (N, S)."""
+        """Return the angles of the states at a time, (N, S, D), and whether each exists, (N, S)."""
         branch, turns = self.turns[:, 0], self.turns[:, 1:]
         angles = self.angles[step][:, branch] + TAU * turns
         limited = np.isfinite(self.high)[:, None]
@@ -285,13 +285,13 @@ class _Choices:
         return angles, known
 
     def steps(self, before: FloatArray, after: FloatArray) -> FloatArray:
-        """Return the turns of the joints between angles (N, …, D)."""
+        """Return the changes of the joint angles between poses, (N, …, D)."""
         gap = after - before
         free = self.free.reshape(len(self.free), *(1,) * (gap.ndim - 2), -1)
         return np.where(free, wrap_signed(gap), gap)
 
     def taken(self, states: npt.NDArray[np.intp]) -> tuple[FloatArray, npt.NDArray[np.int8]]:
-        """Return angles (T, N, D) and branches (T, N) of the chosen states (T, N)."""
+        """Return the angles (T, N, D) and branches (T, N) of the chosen states (T, N)."""
         chosen = self.turns[states]
         branch = chosen[..., 0]
         angles = np.take_along_axis(self.angles, branch[..., None, None], axis=2)[:, :, 0]
@@ -301,7 +301,7 @@ class _Choices:
 
 
 def _stops(table: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the lowest and highest joint angles that stops of both kinds allow, (N, D)."""
+    """Return the lowest and highest joint angles that all stops allow, each (N, D)."""
     ends = table[..., [slot.MIN_COUNT, slot.MAX_COUNT]]
     drive = Drive(table[..., None, :])
     at = drive.angles(np.where(np.isfinite(ends), ends, 0.0))
@@ -310,7 +310,7 @@ def _stops(table: FloatArray) -> tuple[FloatArray, FloatArray]:
     known = np.where(rising, np.isfinite(ends), np.isfinite(ends)[..., ::-1])
     low = np.maximum(table[..., slot.MIN_ANGLE], np.where(known[..., 0], at[..., 0], -np.inf))
     high = np.minimum(table[..., slot.MAX_ANGLE], np.where(known[..., 1], at[..., 1], np.inf))
-    # From a single stop two turns are more than any day needs.
+    # Two turns from a single stop are more than any day needs.
     one_sided = np.isfinite(low) != np.isfinite(high)
     return (
         np.where(one_sided & np.isinf(low), high - 2.0 * TAU, low),
@@ -321,7 +321,7 @@ def _stops(table: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _over_the_top(
     armature: FloatArray, angles: FloatArray, low: FloatArray, high: FloatArray
 ) -> npt.NDArray[np.bool_]:
-    """Return the mask of branches beyond the keyhole, as seen from the home, (T, N, 2).
+    """Return whether each branch is beyond the keyhole as seen from the home, (T, N, 2).
 
     With a₁, a₂ the axes and n the normal, a₁·R(a₂, θ)n = p + q cos θ + r sin θ is largest at the
     keyhole.
@@ -343,7 +343,7 @@ def _over_the_top(
 
 
 def _cheapest(choices: _Choices, start: FloatArray | None, top_cost: float) -> npt.NDArray[np.intp]:
-    """Return the states of the cheapest path, (T, N)."""
+    """Return the states of the path with the least cost, (T, N)."""
     steps, rows = choices.angles.shape[:2]
     branch = choices.turns[:, 0]
     other = branch[:, None] != branch
@@ -353,7 +353,7 @@ def _cheapest(choices: _Choices, start: FloatArray | None, top_cost: float) -> n
         angles, exists = choices.at(t)
         price = np.where(exists, 0.0, np.inf)
         price = price + _MISS * ~choices.able[t][:, branch] + top_cost * choices.top[t][:, branch]
-        # Only what can be avoided counts; large sums would swallow the motion.
+        # Only avoidable costs count, because rounding in large sums would hide the motion.
         price = price - price.min(axis=-1, keepdims=True)
         if before is None:
             if start is not None:
@@ -382,7 +382,7 @@ def _slews(
     normal: FloatArray,
     sun: FloatArray,
 ) -> tuple[Slew, ...]:
-    """Return the steps that change the branch, go back a turn, or leave the sun."""
+    """Return the steps that change the branch, go back by a turn, or do not follow the sun."""
     turn = np.diff(angles, axis=0)
     changed = np.asarray(np.diff(branch, axis=0) != 0)
     whole = np.asarray((np.abs(turn) > np.pi + 1e-9).any(axis=-1))

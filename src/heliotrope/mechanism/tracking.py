@@ -1,8 +1,8 @@
 """Tracking: the drive positions at which the beam reaches its aim.
 
-Global aiming sends light from a direction (the sun) to a point in the field; local aiming sends it
-to a point that is fixed to the mirror (dish, CPV, trough). Both work on the armature, and so serve
-every mechanism and every error model.
+Global aiming sends light from a direction (the sun) to a point in the field; local aiming sends the
+light to a point that is fixed to the mirror (dish, CPV, trough). Both work on the armature, and
+therefore apply to every mechanism and every error model.
 """
 
 from dataclasses import dataclass
@@ -35,19 +35,19 @@ Branch = Literal["both", 0, 1]
 
 
 class Steered(Protocol):
-    """Anything with axes and drives: mechanisms, a heliostat, several heliostats, a plant."""
+    """Any object with axes and drives: mechanisms, one or several heliostats, a plant."""
 
     @property
     def armature(self) -> Armature:
-        """Batch shape (...)."""
+        """Armature, batch shape (...)."""
 
     @property
     def drives(self) -> Drive:
-        """Batch shape (..., D)."""
+        """Drives, batch shape (..., D)."""
 
     @property
     def attachment(self) -> FloatArray:
-        """Transforms from heliostat frames to ENU, for points fixed to the mirrors, (..., 4, 4)."""
+        """Transforms from heliostat frames to ENU for points fixed to the mirrors, (..., 4, 4)."""
 
 
 class TrackingStatus(IntEnum):
@@ -62,7 +62,7 @@ class TrackingStatus(IntEnum):
 
     @property
     def text(self) -> str:
-        """Meaning of the status, one clause."""
+        """Meaning of the status, in one clause."""
         return _TEXTS[self]
 
 
@@ -79,7 +79,7 @@ _TEXTS = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tracking(Value, Framed):
-    """Solutions on one branch or both; B branches, D drives.
+    """Solutions on one or both branches; there are B branches and D drives.
 
     Attributes
     ----------
@@ -96,8 +96,8 @@ class Tracking(Value, Framed):
     iterations
         (..., B).
     best
-        The selected branch, (...): one that reaches the aim with the least motion from the current
-        counts, or else the one with the smallest residual.
+        The selected branch, (...): the branch that reaches the aim with the least motion from the
+        current counts or, if none does, the branch with the smallest residual.
     """
 
     angles: FloatArray
@@ -171,7 +171,7 @@ class Tracking(Value, Framed):
         return np.asarray(self.chosen(self.angles))
 
     def chosen(self, values: np.ndarray) -> np.ndarray:
-        """Return the best branch's part of one of the arrays above, (..., rest)."""
+        """Return the best branch's part of one of the above arrays, (..., rest)."""
         extra = values.ndim - self.best.ndim - 1
         index = self.best.reshape(*self.best.shape, 1, *(1,) * extra).astype(np.intp)
         return np.take_along_axis(values, index, axis=self.best.ndim).squeeze(self.best.ndim)
@@ -198,7 +198,7 @@ def track(
     Parameters
     ----------
     mechanism
-        Mechanisms; a heliostat, several heliostats or a plant, as calibrated; or armatures.
+        Mechanisms; one or several heliostats or a plant, as calibrated; or armatures.
     sun
         Unit vectors to the source, ENU, (..., 3).
     aim
@@ -206,12 +206,12 @@ def track(
         zero joint angles in the heliostat frame (see `Mechanism.attachment`), or in the armature
         frame.
     drives
-        Batch shape (..., D); by default those of the mechanism, or radians for an armature.
+        Drives, batch shape (..., D); by default the mechanism's drives, or radians for an armature.
     current
-        Present counts, (..., D). They select between the branches and between angles that differ by
-        a revolution; without them the middle of the stops decides.
+        Present counts, (..., D). The counts select between the branches and between angles that
+        differ by a revolution; without them the middle of the stops is used.
     branch
-        "both", or the branch to solve (0: −, 1: + in Paden-Kahan), which takes half the time.
+        "both", or the only branch to solve (0: −, 1: + in Paden-Kahan), which takes half the time.
     local
         Whether the aim is a point fixed to the mirror (Grigoriev et al. 2021, "Local aiming").
     tolerance
@@ -219,7 +219,7 @@ def track(
     max_iterations
         Maximum number of fixed-point steps.
     newton
-        Whether to switch to Newton's method where the fixed point converges slowly.
+        Whether to switch to Newton's method where the fixed-point iteration converges slowly.
 
     Returns
     -------
@@ -292,19 +292,19 @@ def track(
 
 @dataclass(frozen=True)
 class TraceStep:
-    """A step of the fixed point (Grigoriev et al. 2021, "Global aiming").
+    """A step of the fixed-point iteration (Grigoriev et al. 2021, "Global aiming").
 
     Attributes
     ----------
     iteration
-        From 1.
+        Number of the iteration, from 1.
     branch
-        0 or 1.
+        Branch, 0 or 1.
     angles
         Joint angles, rad, (D,).
     miss
-        Lateral distance of the reflected ray from the aim point with these angles, m; of a single
-        axis in the plane across it.
+        Lateral distance of the reflected ray from the aim point at these angles, m; for a single
+        axis, measured in the plane perpendicular to it.
     """
 
     iteration: int
@@ -322,23 +322,23 @@ def trace(
     tolerance: float = 1e-9,
     most: int = 50,
 ) -> tuple[TraceStep, ...]:
-    """Return how both branches of one heliostat converge on an aim, without Newton and stops.
+    """Return the steps in which both branches converge on an aim, without Newton and stops.
 
-    A branch ends when it misses by less than the tolerance, or gains nothing more.
+    A branch ends when its miss is below the tolerance or no longer decreases.
 
     Parameters
     ----------
     mechanism, sun, aim, drives
-        As for `track`, of batch shape ().
+        As for `track`, with batch shape ().
     tolerance
         Miss at which a branch ends, m.
     most
-        Largest number of iterations.
+        Maximum number of iterations.
 
     Raises
     ------
     InputError
-        As `track`, or more than one heliostat.
+        As for `track`, or if there is more than one heliostat.
     """
     armature, table = _tables(mechanism, drives)
     if armature.shape or np.ndim(sun) != 1 or np.ndim(aim) != 1:
@@ -383,7 +383,7 @@ def _tables(mechanism: Steered | Armature, drives: Drive | None) -> tuple[Armatu
         )
     if isinstance(mechanism, Armature):
         armature = mechanism
-        # A single axis has none to turn the second; no mirror at all says nothing.
+        # A single-axis tracker has no second axis; an empty array shows nothing.
         single = armature.axis_2.size > 0 and not armature.axis_2.any()
         own = np.stack([direct().table] * (1 if single else 2))
     else:

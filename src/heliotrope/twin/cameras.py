@@ -1,9 +1,9 @@
-"""Cameras of a simulated plant, which see the beams on its targets.
+"""Cameras of a simulated plant, which see the beams on the targets.
 
-Both implement the port `plant.ports.Cameras`. `ExactCamera` returns the true centroid with noise of
-known covariance. `RenderedCamera` renders the frame with all light that is on the target at that
-time, whichever heliostats it comes from, and evaluates it like photographs of a real plant. Neither
-knows more about the measured heliostat than a real camera could.
+Both classes implement the port `plant.ports.Cameras`. `ExactCamera` returns the true centroid with
+noise of known covariance. `RenderedCamera` renders a frame with all light that is on the target at
+that time, whichever heliostats the light comes from, and evaluates the frame like a photograph of a
+real plant. Neither camera knows more about the measured heliostat than a real camera could.
 """
 
 import asyncio
@@ -40,7 +40,7 @@ _ACROSS, _PAINT, _SUN, _GRAIN = 96, 0.05, 0.1, 0.0005
 
 @dataclass(frozen=True)
 class FieldSnapshot:
-    """The true mirrors and sun at the moment of the call.
+    """The true mirrors and the sun at the moment when they are requested.
 
     Attributes
     ----------
@@ -60,13 +60,13 @@ class FieldSnapshot:
     latency: float = 1.0
 
     async def exposure(self) -> float:
-        """Wait for the middle of an exposure; return its time, monotonic s."""
+        """Wait for the middle of an exposure and return its time, monotonic s."""
         await sleep_until(self.clock, self.clock.monotonic() + self.latency)
         return self.clock.monotonic()
 
 
 class ExactCamera:
-    """Returns true beam centroids with noise, and no photograph.
+    """Returns true beam centroids with noise, without photographs.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class ExactCamera:
     Raises
     ------
     InputError
-        A covariance of another shape, or not a covariance.
+        If the covariance has another shape, or is not a valid covariance.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class ExactCamera:
         return self.sees(target)
 
     async def look(self, target: str) -> None:
-        """Do nothing: exact centroids need no empty photograph."""
+        """Do nothing: exact centroids need no photograph of the empty target."""
 
     def view(self, target: str) -> CameraView:
         """Return the last picture of a target."""
@@ -156,7 +156,7 @@ class ExactCamera:
         return Shot(point, at, target.axes.T @ self._plane @ target.axes, tuple(reasons))
 
     async def expose(self, target: Target, view: FaceView | None = None) -> Exposed:
-        """Photograph a target; see `light`."""
+        """Photograph a target and measure the light on it; see `light`."""
         light = await self.light(target, view)
         return Exposed.read(light)
 
@@ -209,7 +209,8 @@ class RenderedCamera:
     sight
         The true mirrors and the sun.
     scenes
-        One target each: camera, target with its marks, light, paint and sensor, without beams.
+        One scene per target: camera, target with its marks, lighting, paint and sensor, but no
+        beams.
     optics
         Mirrors and light.
     settings
@@ -217,19 +218,19 @@ class RenderedCamera:
     seed
         Seed of the sensor's noise.
     worker
-        Evaluates photographs; None: they are rendered and evaluated in the event loop itself.
+        Evaluates photographs; None if they are rendered and evaluated in the event loop itself.
 
     Attributes
     ----------
     taken
         Number of photographs so far, including empty ones.
     last
-        The last frame, None before the first.
+        The last frame; None before the first frame.
 
     Raises
     ------
     InputError
-        A scene with beams, or with more than one target.
+        If a scene has beams, or more than one target.
     """
 
     def __init__(
@@ -262,7 +263,7 @@ class RenderedCamera:
         self.last: Frame | None = None
 
     def start(self, on_alarm: Callable[[Alarm], None]) -> None:
-        """Start the rendering process; a simulated camera never stops responding."""
+        """Start the rendering process."""
         del on_alarm
         if self._drawer is not None:
             self._drawer.start()
@@ -273,11 +274,11 @@ class RenderedCamera:
             self._drawer.close()
 
     def sees(self, target: str) -> bool:
-        """Return whether there is a scene of the target."""
+        """Return whether there is a scene for the target."""
         return target in self._scenes
 
     def awake(self, target: str) -> bool:
-        """Return whether there is a scene of the target."""
+        """Return whether there is a scene for the target; a simulated camera always responds."""
         return self.sees(target)
 
     def view(self, target: str) -> CameraView:
@@ -298,7 +299,10 @@ class RenderedCamera:
         return self._frames[target]
 
     def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
-        """Read later photographs by a camera and a target's marks; the true ones stay."""
+        """Set the camera and target marks used to evaluate later photographs.
+
+        The scene keeps the true camera and marks.
+        """
         self._known = {
             name: (camera if known.name == camera.name else known, surface)
             for name, (known, surface) in self._known.items()
@@ -308,14 +312,14 @@ class RenderedCamera:
         self._settings = replace(self._settings, pictures=known)
 
     async def look(self, target: str) -> None:
-        """Photograph a target before a beam arrives, as background for later photographs.
+        """Photograph the empty target, as the background for later photographs.
 
         Raises
         ------
         InputError
-            A beam is on the target, or the target is not found in the photograph.
+            If a beam is on the target, or the target is not found in the photograph.
         UnknownNameError
-            There is no scene of the target.
+            If there is no scene for the target.
         """
         picture, _ = await self._take(target)
         reading = picture.reading(target)
@@ -330,12 +334,12 @@ class RenderedCamera:
         self._empty[target] = picture.frame
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return the beam seen on a target; the camera does not know which heliostat it is from.
+        """Return the beam seen on a target; the camera cannot tell which heliostat sends it.
 
         Raises
         ------
         UnknownNameError
-            There is no scene of the target.
+            If there is no scene for the target.
         """
         del heliostat
         picture, at = await self._take(target.name)
@@ -347,7 +351,7 @@ class RenderedCamera:
         Raises
         ------
         UnknownNameError
-            There is no scene of the target.
+            If there is no scene for the target.
         """
         name = target.name
         camera, known = self._known_of(name)
@@ -364,7 +368,7 @@ class RenderedCamera:
         return Exposed(at, asyncio.create_task(read()))
 
     def beams(self, target: Target) -> tuple[Thrown, ...]:
-        """Return the present beams on a target, and those beside it that a frame would show."""
+        """Return the beams that are on a target now, or so close that a frame would show them."""
         return thrown(target, self._sight.mirrors(), self._sight.sun(), self._optics)
 
     def _known_of(self, name: str) -> tuple[Camera, Target]:
@@ -373,7 +377,7 @@ class RenderedCamera:
         return self._known[name]
 
     async def _expose(self, name: str) -> tuple[Exposure, float]:
-        """Expose a frame; return the light and the time of exposure, monotonic s."""
+        """Expose a frame; return the light and the time of the exposure, monotonic s."""
         at = await self._sight.exposure()
         scene = self._scenes[name]
         self.taken += 1
@@ -395,7 +399,7 @@ class RenderedCamera:
         return await asyncio.to_thread(self._drawer.draw, shown)
 
     async def _take(self, name: str) -> tuple[Photograph, float]:
-        """Take a photograph; return its evaluation and the time of exposure, monotonic s."""
+        """Take a photograph; return its evaluation and the time of the exposure, monotonic s."""
         self._known_of(name)
         shown, at = await self._expose(name)
         (camera, target), settings = self._known[name], self._settings

@@ -1,4 +1,4 @@
-"""Photographs of a simulated field, rendered in a process beside the plant.
+"""Photographs of a simulated field, rendered in a separate process.
 
 A photograph of a hundred beams takes a second of CPU time. If it were rendered in the process of
 the plant and its field, it would compete with their event loop.
@@ -41,11 +41,11 @@ class Optics:
     slope_error
         Standard deviation of the mirrors' normals per axis, rad.
     dni
-        W/m².
+        Direct normal irradiance, W/m².
     reflectivity
-        Share, 0 to 1.
+        Reflected fraction, 0 to 1.
     facets
-        Columns and rows, canted at the slant range.
+        Numbers of facet columns and rows; facets are canted for the slant range.
     """
 
     slope_error: float = 1e-3
@@ -100,8 +100,8 @@ class Drawer:
     Parameters
     ----------
     load
-        Called first in the process, such as `twin.warm.drawing`; None: the first photograph takes
-        longer.
+        Function that the process calls first, such as `twin.warm.drawing`; if None, the first
+        photograph takes longer.
     """
 
     def __init__(self, load: Callable[[], None] | None = None) -> None:
@@ -111,7 +111,7 @@ class Drawer:
         self._line: Connection | None = None
 
     def start(self) -> None:
-        """Start the process, which needs some seconds before its first photograph."""
+        """Start the process, which needs several seconds until it can render."""
         with self._mine:
             self._begun()
 
@@ -121,7 +121,7 @@ class Drawer:
         Raises
         ------
         FetchError
-            The process has died.
+            If the process has died.
         InputError
             If rendering raises it.
         """
@@ -142,7 +142,7 @@ class Drawer:
         return answer
 
     def close(self) -> None:
-        """End the process at once; calls that wait for a photograph are refused."""
+        """End the process at once; calls that wait for a photograph raise an error."""
         if (process := self._process) is not None:
             process.kill()
         with self._mine:
@@ -190,7 +190,7 @@ def _drawing(line: Connection, load: Callable[[], None] | None) -> None:
 def thrown(
     target: Target, mirrors: Sequence[TrueMirror], sun: FloatArray, optics: Optics
 ) -> tuple[Thrown, ...]:
-    """Return the beams of mirrors on a target or close beside it."""
+    """Return the beams that mirrors send onto a target or close beside it."""
     beams = []
     for mirror in mirrors:
         if not within(target, mirror.on(target, sun), NEAR):

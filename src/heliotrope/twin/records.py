@@ -14,18 +14,18 @@ from heliotrope.plant.orders.audit import STOPPED, AuditError, Record
 
 
 class RecordsDisk:
-    """A disk with records.
+    """A disk with command records.
 
     Attributes
     ----------
     records
-        Records by identity, in the order in which they began.
+        Records by identity, in the order in which the commands began.
     full
         Whether nothing can be written.
     delay
         Time that each piece of work takes, s.
     well_since
-        Time from which the disk has had space and has kept up with the work, s.
+        Time since which the disk has had space and has kept up with the work, s.
     """
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class RecordsDisk:
         self.delay = delay
 
     def queue(self, clock: Clock, context: Context) -> "DiskQueue":
-        """Return the queue of a run of the plant's program; see `DiskQueue`."""
+        """Return the work queue for a run of the plant program; see `DiskQueue`."""
         self._queue = DiskQueue(self, clock, context)
         return self._queue
 
@@ -80,9 +80,9 @@ class DiskQueue:
     Parameters
     ----------
     disk
-        Its delay applies to each piece of work.
+        Disk whose delay applies to each piece of work.
     clock
-        True time.
+        Clock that shows true time.
     context
         Context of the program to which the work belongs.
 
@@ -124,7 +124,7 @@ class DiskQueue:
         self._waiting.clear()
 
     def close(self) -> None:
-        """Do nothing: the work goes on by itself."""
+        """Do nothing, because the pending work continues by itself."""
 
 
 class SimulatedAudit:
@@ -133,9 +133,10 @@ class SimulatedAudit:
     Parameters
     ----------
     disk
-        Holds the records.
+        Disk that stores the records.
     started
-        UTC, ISO 8601; closes the records that an earlier run of the plant left open.
+        Start of this run, UTC, ISO 8601; used to close records that an earlier run of the plant
+        left open.
 
     Raises
     ------
@@ -192,7 +193,7 @@ class SimulatedAudit:
         self._check()
 
     def lose(self) -> None:
-        """Accept nothing more, because the plant program has ended, at whatever point."""
+        """Accept no further records, because the plant program has ended, at whatever point."""
         self._lost = True
 
     def _check(self) -> None:
@@ -201,21 +202,21 @@ class SimulatedAudit:
         self._disk.check()
 
     def close(self) -> None:
-        """Close the audit; everything is on the disk already."""
+        """Close the audit; all records are already on the disk."""
 
 
 class EmergencyDisk:
-    """The record of an emergency that survives the plant's program; an `EmergencyRecord`."""
+    """The record of an emergency, an `EmergencyRecord` that survives the plant program."""
 
     def __init__(self) -> None:
         self._document = ""
 
     def emergency(self) -> str:
-        """Return the document, or "" if there is none."""
+        """Return the stored document; "" if there is none."""
         return self._document
 
     def keep_emergency(self, document: str) -> None:
-        """Replace the document."""
+        """Replace the stored document."""
         self._document = document
 
 
@@ -226,7 +227,7 @@ class AssignedDisk:
         self._points: dict[str, Places] = {}
 
     def read(self) -> dict[str, Places]:
-        """Return the stored points by kind."""
+        """Return the stored points, by kind."""
         return {kind: dict(places) for kind, places in self._points.items()}
 
     def keep(self, points: Mapping[str, Places]) -> None:

@@ -26,9 +26,9 @@ class FluxSensor:
     clock
         Clock of the event loop.
     stand
-        Returns true normals and vertices, (N, 3).
+        Function that returns the true normals and vertices, each (N, 3).
     sun
-        Returns the true direction to the sun, (3,).
+        Function that returns the true direction to the sun, (3,).
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class FluxSensor:
         self._read_at = -math.inf
 
     def share(self) -> float:
-        """Return the present flux, as a share of the flux with every heliostat on a receiver."""
+        """Return the present flux as a fraction of the flux with every heliostat on a receiver."""
         light = self._sun()
         if light[2] <= 0.0:
             return 0.0
@@ -60,7 +60,7 @@ class FluxSensor:
         return sum(light_share(*stand, light, *aperture) for aperture in self._apertures)
 
     async def news(self) -> Readings:
-        """Yield a reading each second."""
+        """Yield a reading every second."""
         now = self._clock.monotonic()
         if now - self._read_at < _EVERY:
             return Readings()
@@ -71,7 +71,7 @@ class FluxSensor:
 def light_share(
     normal: FloatArray, vertex: FloatArray, sun: npt.ArrayLike, middle: npt.ArrayLike, radius: float
 ) -> float:
-    """Return the share of a field's light that reaches a receiver, 0 to 1.
+    """Return the fraction of a field's light that reaches a receiver, 0 to 1.
 
     Parameters
     ----------
@@ -83,7 +83,8 @@ def light_share(
         Middle of the receiver, (3,), m.
     radius
         Beams whose axis passes closer than this count as on the receiver, m. Each beam is weighted
-        by its cosine of incidence, relative to the case in which all beams are aimed at the middle.
+        by its cosine of incidence, and the sum is divided by its value with all beams aimed at the
+        middle.
     """
     s, point = np.asarray(sun, dtype=np.float64), np.asarray(middle, dtype=np.float64)
     cosine = normal @ s

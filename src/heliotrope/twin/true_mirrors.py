@@ -11,7 +11,7 @@ from heliotrope.geometry import FloatArray, reflect
 from heliotrope.optics import Mirrors, Scene, Shading, centroid_shift, equal_facets
 from heliotrope.twin.boards.board import Board
 
-#: Light further from a target's centre than this many half diagonals is left out.
+#: Light farther from a target's centre than this many half diagonals is omitted.
 NEAR = 2.0
 #: Cosine of incidence below which the light of a mirror is too weak to draw.
 GRAZING = 0.05
@@ -19,20 +19,20 @@ GRAZING = 0.05
 
 @dataclass(frozen=True)
 class TrueMirror:
-    """True position and size of one mirror.
+    """True position and size of a mirror.
 
     Attributes
     ----------
     heliostat
         Name.
     vertex
-        ENU, m, (3,).
+        Vertex of the mirror, ENU, m, (3,).
     normal
         Unit normal, (3,).
     width, height
         m.
     neighbours
-        Mirrors that may shade or block it; None: none does.
+        Mirrors that may shade or block this mirror; None if there are none.
     """
 
     heliostat: str
@@ -65,7 +65,7 @@ class TrueMirror:
         return point + effect.shift @ target.axes, 1.0 - effect.hidden
 
     def on(self, target: Target, sun: FloatArray) -> FloatArray:
-        """Return where its ray meets the plane of a target, ENU, m, (3,); NaN if it does not."""
+        """Return where the reflected ray meets a target's plane, ENU, m, (3,); NaN if nowhere."""
         if not float(self.normal @ sun) > GRAZING:
             return np.full(3, np.nan)
         return target.intersect(self.vertex, reflect(sun, self.normal))
@@ -74,7 +74,7 @@ class TrueMirror:
 def mirrors_of(
     boards: Mapping[str, Board], width: float = 3.0, height: float = 2.0
 ) -> Callable[[], Sequence[TrueMirror]]:
-    """Return a function that returns the mirrors of boards by name, all of one size in m."""
+    """Return a function that looks up the mirrors of boards by name; all have one size in m."""
 
     def mirrors() -> Sequence[TrueMirror]:
         return [TrueMirror(name, *board.mirror(), width, height) for name, board in boards.items()]
@@ -96,19 +96,19 @@ def mirrors_near(
     Parameters
     ----------
     target
-        Only its corners and normal are used.
+        Target, of which only the corners and the normal are used.
     sun
         Unit vector to the sun, (3,).
     stand
-        Unit normals and vertices of N mirrors, (N, 3) each.
+        Unit normals and vertices of N mirrors, each (N, 3).
     names
-        Heliostats, N.
+        Names of the N heliostats.
     sizes
         Width and height of the mirrors, m, (N, 2).
     reach
         Largest distance from the centre, in half diagonals of the target.
     beside
-        Rows of the neighbours of each mirror, (N, J); None: no neighbour hides anything.
+        Indices of the neighbours of each mirror, (N, J); None if no neighbour hides anything.
     """
     middle = np.asarray(target.corners).mean(axis=0)
     limit = reach * 0.5 * float(np.hypot(target.width, target.height))
@@ -137,7 +137,7 @@ def mirrors_near(
 
 
 def within(target: Target, point: FloatArray, share: float = 0.0) -> bool:
-    """Return whether a point is on a target, or within a share of its half diagonal."""
+    """Return whether a point lies within a multiple of a target's half diagonal from its centre."""
     if not np.isfinite(point).all():
         return False
     away = np.abs(target.plane_coordinates(point) - target.plane_coordinates(_middle(target)))

@@ -1,18 +1,18 @@
 """Compile the kernels of the simulated field and of its photographs; see `heliotrope.warm`.
 
 Run ``python -m heliotrope.twin.warm`` once after an installation, after ``heliotrope.warm``; it
-takes some three seconds.
+takes about three seconds.
 """
 
 
 def main() -> None:
-    """Compile both."""
+    """Compile the kernels of the field and of the photographs."""
     moving()
     drawing()
 
 
 def moving() -> None:
-    """Move a field of two heliostats as a simulated plant's loop does."""
+    """Move a field of two heliostats in the same way as a simulated plant's loop."""
     from heliotrope.field.layouts import malan_plant
     from heliotrope.lcu.lease import UNIT
     from heliotrope.links.clock import VirtualClock
@@ -29,7 +29,7 @@ def moving() -> None:
 
 
 def drawing() -> None:
-    """Render a photograph of one beam as the process of `drawing.Drawer` does."""
+    """Render a photograph of one beam in the same way as the process of `drawing.Drawer`."""
     from datetime import UTC, datetime
 
     from heliotrope import sun

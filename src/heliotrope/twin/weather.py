@@ -15,7 +15,9 @@ _MEAN, _GUST = 3.0, 0.5
 
 
 class WeatherStation:
-    """Wind and direct irradiance at a simulated plant; this wind does not deflect the mirrors.
+    """Wind and direct irradiance at a simulated plant.
+
+    This wind does not deflect the mirrors.
 
     Parameters
     ----------
@@ -24,7 +26,7 @@ class WeatherStation:
     clock
         Clock of the event loop.
     sun
-        Returns the true direction to the sun, (3,).
+        Function that returns the true direction to the sun, (3,).
     seed
         Seed of the wind.
 
@@ -43,7 +45,7 @@ class WeatherStation:
         self._wind = Wind(_MEAN, gust=_GUST, compliance=0.0, seed=seed)
 
     def readings(self) -> dict[str, float]:
-        """Return the present readings, m/s and W/m²."""
+        """Return the present readings: wind, m/s, and irradiance, W/m²."""
         elevation = float(np.arcsin(np.clip(self._sun()[2], -1.0, 1.0)))
         wind = self._wind.readings(np.zeros(3), self._clock.monotonic())
         return wind | {DNI_READING: clear_sky(elevation, self._altitude)}

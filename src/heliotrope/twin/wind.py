@@ -2,9 +2,9 @@
 
 The wind is a function of position and time, so single boards and a vectorised field experience the
 same wind. Turbulence is frozen and carried along by the mean wind (Taylor): a sum of waves whose
-spectrum at one point is von Kármán's. Gusts are fronts of the shape (1 − cos)/2, one drawn for each
-time window. A mirror rotates in proportion to the dynamic pressure, as a flat plate does, towards
-the position broadside to the wind.
+spectrum at one point is von Kármán's. Gusts are fronts of the shape (1 − cos)/2; one gust is drawn
+for each time window. A mirror rotates in proportion to the dynamic pressure, as a flat plate does,
+towards the position broadside to the wind.
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ class Wind:
     Raises
     ------
     InputError
-        Values out of range.
+        If a value is out of range.
     """
 
     speed: float = 5.0
@@ -82,7 +82,10 @@ class Wind:
 
     @cached_property
     def _waves(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Frequencies (Hz), lateral wave numbers (1/m), phases, amplitudes (m/s), each (W,)."""
+        """Return frequencies (Hz), lateral wave numbers (1/m), phases and amplitudes (m/s).
+
+        Each has shape (W,).
+        """
         rng = np.random.default_rng((self.seed, 1))
         edges = np.geomspace(SLOWEST, FASTEST, WAVES + 1)
         # Random within the band, because equally spaced frequencies would repeat.
@@ -97,9 +100,10 @@ class Wind:
         return rate, across, rng.uniform(0.0, 2.0 * np.pi, WAVES), height
 
     def at(self, place: npt.ArrayLike, time: npt.ArrayLike) -> FloatArray:
-        """Return the wind speed at positions (..., 3), m, and times (...), s, which broadcast; m/s.
+        """Return the wind speed at positions and times, m/s.
 
-        The direction does not change; turbulence never reverses the wind.
+        Positions (..., 3), m, and times (...), s, are broadcast. The direction does not change;
+        turbulence never reverses the wind.
         """
         x = as_vectors(place, "wind: place")
         along = x @ self.direction
@@ -126,8 +130,9 @@ class Wind:
     def turned(self, normal: npt.ArrayLike, place: npt.ArrayLike, time: float) -> FloatArray:
         """Return the wind-deflected normals (..., 3) of mirrors at positions (..., 3), m.
 
-        The moment on a flat plate is proportional to sin 2β, where β is the angle between normal
-        and wind: zero broadside and edge on (as at stow). The moment turns the plate broadside.
+        The moment on a flat plate is proportional to sin 2β, where β is the angle between the
+        normal and the wind: it is zero broadside and edge on (as at stow). The moment turns the
+        plate broadside.
         """
         n, w = as_float(normal), self.direction
         pressure = 0.5 * DENSITY * self.at(place, time) ** 2
@@ -137,7 +142,7 @@ class Wind:
         return as_float(moved / np.linalg.norm(moved, axis=-1, keepdims=True))
 
     def readings(self, place: npt.ArrayLike, time: float) -> dict[str, float]:
-        """Return an anemometer's readings at a place (3,) for the safety table, m/s, by sensor."""
+        """Return an anemometer's readings at a place (3,), m/s, by sensor of the safety table."""
         short = time - np.linspace(0.0, GUST_MEAN_S, 13)
         long = time - np.linspace(0.0, MEAN_S, 601)
         return {
@@ -148,7 +153,7 @@ class Wind:
 
 @lru_cache(maxsize=1024)
 def _gust(seed: int, window: int) -> tuple[float, float]:
-    """Return the start of a window's gust, s, and its height relative to the mean height."""
+    """Return a window's gust: its start, s, and its height relative to the mean height."""
     # Windows before time 0 have gusts too, but a seed may not be negative.
     rng = np.random.default_rng((seed, 2, window & 0xFFFFFFFF))
     return WINDOW_S * (window + float(rng.random())), float(rng.exponential())

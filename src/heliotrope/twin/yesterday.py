@@ -1,15 +1,14 @@
-"""Yesterday's calibrations of a simulated field, as its plant would have measured and fitted them.
+"""Yesterday's calibrations of a simulated field, as its plant would have measured them.
 
 A simulated plant may begin on its second day of commissioning. This module creates the first day
 within a second, without simulating it step by step: the true heliostats send beams to the targets
 for yesterday's sun positions, centroids have the noise that the visits state, and the plant's
-estimator fits all heliostats at once. The errors of these calibrations are therefore those that
-their covariances predict, provided that the true heliostats differ from the plant file as the
-priors say.
+estimator fits all heliostats at once. The errors of these calibrations therefore agree with their
+covariances, provided that the true heliostats differ from the plant file as the priors say.
 
 The heliostats nearest to a target are visited first, as in the schedule for a new field, because a
-search for a beam takes the least time there. When all have been visited once, the first of them are
-visited again. Drives do not drift overnight, although the plant allows for drift.
+search for a beam takes the least time there. When all heliostats have been visited once, the first
+of them are visited again. Drives do not drift overnight, although the plant allows for drift.
 """
 
 from collections.abc import Mapping, Sequence
@@ -63,10 +62,10 @@ class Yesterday:
     names
         The heliostats of the plant, which the sightings refer to by index.
     sightings, targets
-        The M sightings, and the name of the target of each, (M,).
+        The M sightings, and each sighting's target by name, (M,).
     calibrations
-        One for each visit, older versions before newer ones; their sightings are rows of
-        ``sightings``.
+        One calibration per visit, older versions before newer ones; their sightings refer to rows
+        of ``sightings``.
     visits
         The visits in order of time.
     """
@@ -78,12 +77,12 @@ class Yesterday:
     visits: tuple[VisitEntry, ...]
 
     async def keep(self, records: Records) -> None:
-        """Keep the day in a store, as a plant keeps its own.
+        """Save the day in a store, as a plant saves its own days.
 
         Raises
         ------
         InputError
-            If the store has calibrations of these heliostats.
+            If the store already has calibrations of these heliostats.
         StoreError
             If the store cannot be written.
         """
@@ -110,7 +109,7 @@ class Yesterday:
 
 @dataclass(frozen=True)
 class StoredParameters:
-    """Parameters of K heliostats by name, each (K,); a `mechanism.chain.Calibrated`."""
+    """Parameters of K heliostats, by name, each (K,); a `mechanism.chain.Calibrated`."""
 
     heliostats: tuple[str, ...]
     parameters: Mapping[str, FloatArray]
@@ -125,11 +124,11 @@ async def begin_second_day(
     count: int = COUNT,
     seed: int = 0,
 ) -> Plant:
-    """Keep yesterday in a new store, and return the plant with the calibrations of its store.
+    """Save yesterday in a new store, and return the plant with the store's calibrations.
 
-    A world of that plant has local controllers that store these calibrations; the plant's program,
-    with the unchanged design and store, loads the same calibrations. Nothing is added to a store
-    that already has calibrations.
+    In a world made from that plant, the local controllers store these calibrations. The plant
+    program loads the same calibrations from the unchanged design and the store. Nothing is added to
+    a store that already has calibrations.
 
     Parameters
     ----------
@@ -152,7 +151,7 @@ async def begin_second_day(
 
 
 def with_records(design: Plant, records: Sequence[HeliostatCalibration]) -> Plant:
-    """Return a plant whose heliostats have the parameters of calibrations, at most one for each."""
+    """Return a plant with the parameters of calibrations, at most one calibration per heliostat."""
     for stored in by_model(records):
         design = design.with_calibration(stored)
     return design
@@ -181,16 +180,16 @@ def measure_yesterday(
     seed: int = 0,
     cycle: CycleSettings = CYCLE,
 ) -> Yesterday:
-    """Return the visits of the day before a start, and the resulting calibrations.
+    """Return the visits of the day before ``start``, and the resulting calibrations.
 
     Parameters
     ----------
     design, truth
         The plant, and its true mechanisms in the order of ``design.names``, (N,).
     start
-        Aware time of the present day.
+        Time on the present day, with a time zone.
     count
-        Number of heliostats to be measured. A visit is left out if it can use no target.
+        Number of heliostats to be measured. A visit is omitted if it can use no target.
     seed
         Seed of the noise.
     cycle
@@ -199,7 +198,7 @@ def measure_yesterday(
     Raises
     ------
     InputError
-        A count below 0, or a plant without a target.
+        If the count is below 0, or the plant has no target.
     """
     if count < 0 or not design.targets:
         raise InputError(
@@ -252,7 +251,7 @@ def _photographed(
     cycle: CycleSettings,
     rng: np.random.Generator,
 ) -> tuple[Sightings, npt.NDArray[np.str_]]:
-    """Return the sightings of all visits for which a target is usable, and their targets.
+    """Return the sightings of all visits that have a usable target, and the targets.
 
     Each heliostat uses the target that its beam meets at the smallest angle of incidence.
     """
@@ -285,7 +284,7 @@ def _photographed(
 def _thrown(
     truth: Mechanism, suns: FloatArray, target: Target, sigma: float, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return step counts (V, S, 2) and measured centroids (V, S, 3) of V heliostats on a target.
+    """Return step counts (V, S, 2) and measured centroids (V, S, 3) of V beams on a target.
 
     Parameters
     ----------
@@ -314,7 +313,7 @@ class _Fits:
     Parameters
     ----------
     design, group, offset
-        The plant, one of its groups, and the row of its first heliostat.
+        The plant, one of its groups, and the index of the group's first heliostat.
     cycle
         Settings of a visit.
     """
@@ -334,14 +333,14 @@ class _Fits:
     ) -> list[tuple[HeliostatCalibration, VisitEntry]]:
         """Return the calibrations of K heliostats, and the last visit of each.
 
-        A fit that does not converge is left out.
+        Fits that do not converge are omitted.
 
         Parameters
         ----------
         made, targets
-            All sightings, and the name of the target of each, (M,).
+            All sightings, and each sighting's target by name, (M,).
         used
-            Rows of the sightings of each heliostat, by time, (K, S).
+            Indices of each heliostat's sightings, in order of time, (K, S).
         """
         group, (count, size) = self._group, used.shape
         rows = made.heliostat[used[:, 0]] - self._offset
@@ -407,7 +406,7 @@ class _Fits:
     def _predicted(
         self, mechanism: Mechanism, rows: Rows, covariance: FloatArray, suns: FloatArray
     ) -> list[float]:
-        """Return the predicted errors of K normals at their aims, rad; NaN if unknown."""
+        """Return the predicted errors of K normals at their aims, rad, (K,); NaN if unknown."""
         names = [self._group.names[row] for row in rows]
         given = default_aims(self._design, names, self._group.position[rows], None)
         aims = np.stack([given[name] for name in names])

@@ -1,4 +1,4 @@
-"""Shared by the drone commands: arguments, options and progress bars."""
+"""Arguments, options and progress bars that the drone commands share."""
 
 import os
 import re
@@ -72,7 +72,7 @@ def cores(processes: int) -> int:
 
 @contextmanager
 def stages(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Yield a function (what, done, all) that draws a progress bar for each stage."""
+    """Yield a function (what, done, total) that draws a progress bar for each stage."""
     with ExitStack() as stack:
         bars: dict[str, Callable[[int, int], None]] = {}
 
@@ -87,7 +87,10 @@ def stages(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
 
 
 def rendered_camera(size: str, focal_px: float = 0.0) -> "LedCamera":
-    """Return the camera of rendered photographs; a focal length of 0 is 3/4 of the width."""
+    """Return the camera of rendered photographs.
+
+    A focal length of 0 stands for 3/4 of the image width.
+    """
     import numpy as np
 
     from heliotrope.airborne.photo import LedCamera
@@ -107,7 +110,7 @@ def rendered_camera(size: str, focal_px: float = 0.0) -> "LedCamera":
 
 
 def formats(text: str) -> tuple[str, ...]:
-    """Return the formats of waypoint files specified by --formats."""
+    """Return the formats of waypoint files that --formats specifies."""
     from heliotrope.airborne.plan.flight_files import FORMATS
     from heliotrope.errors import InputError
 

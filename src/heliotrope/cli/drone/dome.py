@@ -1,4 +1,4 @@
-"""``heliotrope drone dome``: a flight over coded targets that measures RTK (appendix A)."""
+"""``heliotrope drone dome``: a flight over coded targets that checks RTK (appendix A)."""
 
 from dataclasses import replace
 from pathlib import Path

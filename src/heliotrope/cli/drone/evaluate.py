@@ -1,4 +1,4 @@
-"""``heliotrope drone evaluate``: the orientations of mirrors from a drone's photographs."""
+"""``heliotrope drone evaluate``: mirror orientations from a drone's photographs."""
 
 import sys
 from collections.abc import Sequence
@@ -61,7 +61,7 @@ def evaluate(
     scheduler: calibration.SchedulerOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Find mirrors and lamp in a drone's photographs: orientations with their accuracy."""
+    """Find mirrors and the lamp in a drone's photographs, and print orientations with accuracy."""
     from heliotrope.airborne.evaluate.bundle import Priors
     from heliotrope.airborne.evaluate.flight import evaluate_flight
     from heliotrope.airborne.evaluate.reference import (

@@ -1,4 +1,4 @@
-"""``heliotrope drone match``: pictures and a table in which a person names mirrors."""
+"""``heliotrope drone match``: pictures and a table in which a user names mirrors."""
 
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +23,7 @@ def match(
     out: shared.OutOption = Path("out/drone"),
     processes: shared.ProcessesOption = 0,
 ) -> None:
-    """Show photographs with numbered outlines, in which a person names mirrors by hand."""
+    """Show photographs with numbered outlines, so that a user can name the mirrors by hand."""
     from heliotrope.airborne.evaluate.flight import read_flight
     from heliotrope.airborne.evaluate.folder import open_flights
     from heliotrope.airborne.evaluate.matching_sheets import write_sheets

@@ -1,4 +1,4 @@
-"""``heliotrope drone plan``: a drone's campaign over a field, as waypoint files."""
+"""``heliotrope drone plan``: a drone campaign over a field, as waypoint files."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -133,7 +133,7 @@ def plan(
     aircraft: Annotated[str, typer.Option(help="Drone for DJI's files.")] = "M3E",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Plan a drone's campaign: clusters, hover patterns, commands of the mirrors, sorties."""
+    """Plan a drone campaign: clusters, hover patterns, heliostat commands, sorties."""
     import numpy as np
 
     from heliotrope.airborne.plan.flight import Craft

@@ -36,7 +36,7 @@ def rtk(
     scheduler: calibration.SchedulerOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Compare RTK positions with those from the photographs alone."""
+    """Compare RTK positions with positions derived from the photographs alone."""
     from heliotrope.airborne.evaluate.bundle import Priors
     from heliotrope.airborne.evaluate.folder import designed_shape, open_flight
     from heliotrope.airborne.evaluate.reading import read_many
@@ -128,5 +128,5 @@ def _show(check: "RtkCheck") -> None:
 
 
 def _mm(value: float) -> str:
-    """Return metres as mm; a dash if unknown."""
+    """Return metres as mm; a dash if the value is unknown."""
     return f"{1e3 * value:.1f}" if math.isfinite(value) else "–"

@@ -1,4 +1,4 @@
-"""``heliotrope drone simulate``: photographs of a simulated flight, with the truth."""
+"""``heliotrope drone simulate``: photographs of a simulated flight, with the true values."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -118,7 +118,7 @@ def simulate(
         int, typer.Option(min=0, max=2**63 - 1, help="Seed of all random numbers.")
     ] = 0,
 ) -> None:
-    """Render a flight: photographs as a DJI drone writes them, commands, camera, truth."""
+    """Render a flight: photographs as written by a DJI drone, commands, camera, true values."""
     import numpy as np
 
     from heliotrope.airborne.simulate import rendering
@@ -217,7 +217,7 @@ class _Drawing:
 def _campaign(
     drawing: _Drawing, plan: Path, selection: str, mirrors: "Heliostats", folder: Path
 ) -> None:
-    """Render the stations of a plan, each into its folder CLUSTER-POINT."""
+    """Render the stations of a plan, each station into its folder CLUSTER-POINT."""
     from heliotrope.airborne.plan.stations import read_stations
     from heliotrope.airborne.simulate.simulation import install
     from heliotrope.errors import UnknownNameError

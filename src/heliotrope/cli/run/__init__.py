@@ -1,1 +1,1 @@
-"""``heliotrope run``: a plant at work with its console."""
+"""``heliotrope run``: a plant in operation with its console."""

@@ -1,4 +1,4 @@
-"""Evidence that leaves a running plant's computer: security events, alarms, chain heads."""
+"""Evidence sent away from a plant's computer: security events, alarms, hash-chain heads."""
 
 import asyncio
 import contextlib
@@ -15,7 +15,7 @@ from heliotrope.store import chain
 from heliotrope.store.digests import Head
 from heliotrope.store.keeper import Keeper
 
-#: Default time between exports of the heads, hours, and the shortest and longest.
+#: Default, shortest and longest time between exports of the heads, hours.
 HOURS, _LEAST, _MOST = 1.0, 0.01, 168.0
 #: Interval between checks of the sender, s.
 _LOOKED = 2.0
@@ -23,7 +23,7 @@ _LOOKED = 2.0
 
 @dataclass(frozen=True)
 class Evidence:
-    """Options for what leaves the computer.
+    """Options for the evidence that leaves the plant's computer.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Evidence:
 
 @contextlib.asynccontextmanager
 async def leaving(live: PlantAssembly, keeper: Keeper, chosen: Evidence) -> AsyncIterator[None]:
-    """Forward security events and alarms, and export heads, during a block."""
+    """Forward security events and alarms, and export chain heads, during a block."""
     receiver, sender = chosen.receiver, None
     async with asyncio.TaskGroup() as group:
         tasks = []
@@ -107,7 +107,7 @@ async def _export(live: PlantAssembly, keeper: Keeper, chosen: Evidence) -> None
 
 
 async def export(live: PlantAssembly, keeper: Keeper, folder: Path | None) -> None:
-    """Write the heads of the chains to a folder, if specified, and record them as events."""
+    """Write the chain heads to a folder, if one is specified, and record them as events."""
     now, kind = live.clock.utc(), alarms.HEADS
 
     def write() -> tuple[Head, ...]:

@@ -1,4 +1,4 @@
-"""A plant at work, simulated or real: store, archive, console, printed lines, and its end."""
+"""A plant in operation, simulated or real: store, archive, console, printed lines, shutdown."""
 
 import asyncio
 import contextlib
@@ -86,7 +86,7 @@ _SAID = 10.0
 
 @dataclass(frozen=True)
 class Shown:
-    """Options of console, store and lines; see `cli.run.command`."""
+    """Options of the console, the store and the printed lines; see `cli.run.command`."""
 
     host: str = "127.0.0.1"
     port: int = 8080
@@ -126,7 +126,7 @@ class Shown:
 
     @property
     def marks(self) -> Path | None:
-        """Plant file that stores target views marked by users; None: they are not stored."""
+        """Plant file that stores target views marked by users; None if they are not stored."""
         return None if self.data is None else self.data / "marks" / "plant.toml"
 
     def settings(self) -> Any:
@@ -198,7 +198,7 @@ def _missing(error: ImportError) -> InputError:
 
 @contextlib.contextmanager
 def computing(*loads: Callable[[], None]) -> Iterator[WorkerProcesses]:
-    """Start the worker processes of a plant, and load the modules for computations in its loop.
+    """Start a plant's worker processes, and load the modules needed in the plant's loop.
 
     ``loads`` are functions that load further modules for the loop.
     """
@@ -211,7 +211,7 @@ def computing(*loads: Callable[[], None]) -> Iterator[WorkerProcesses]:
 
 @contextlib.contextmanager
 def one_error() -> Iterator[None]:
-    """Raise the first error of Heliotrope or the system in place of the group that holds it."""
+    """Raise the first Heliotrope or system error instead of the exception group around it."""
     try:
         yield
     except BaseExceptionGroup as group:
@@ -229,15 +229,15 @@ def _leaves(error: BaseException) -> list[BaseException]:
 
 
 class Ending:
-    """The end requested by Ctrl-C and SIGTERM; created in the loop of the plant.
+    """The shutdown requested by Ctrl-C or SIGTERM; to be created in the plant's loop.
 
     Attributes
     ----------
     asked
         Set by the first signal: the plant shuts down in order.
     at_once
-        Set by the second signal: the program ends without waiting. If it still runs after
-        `AT_ONCE`, it is killed; the store is then in the state after a power failure.
+        Set by the second signal: the program ends without waiting. If the program is still running
+        after `AT_ONCE`, it is killed; the store is then left as after a power failure.
     """
 
     def __init__(self) -> None:
@@ -247,7 +247,7 @@ class Ending:
             self._loop.add_signal_handler(number, self.ask)
 
     def ask(self) -> None:
-        """Shut down in order; from now on a signal requests an immediate end."""
+        """Shut down in order; after this call, a signal requests an immediate end."""
         self.asked.set()
         for number in _SIGNALS:
             self._loop.remove_signal_handler(number)
@@ -265,10 +265,10 @@ class Ending:
 
 @contextlib.contextmanager
 def store(shown: Shown) -> Iterator[tuple[Keeper, Path]]:
-    """Open the store: a database, or a folder; yield it, and the folder of the plant.
+    """Open the store, a database or a folder; yield the store and the plant's folder.
 
-    Without ``--data`` the folder of the plant is deleted afterwards. Whatever is created in the
-    meantime, including by the console process, is accessible only to this user.
+    Without ``--data`` the folder of the plant is deleted afterwards. Files created in the meantime,
+    even by the console process, are accessible only to this user.
     """
     mask = os.umask(0o077)
     folder = shown.data or Path(tempfile.mkdtemp(prefix="heliotrope-"))
@@ -287,14 +287,14 @@ def store(shown: Shown) -> Iterator[tuple[Keeper, Path]]:
 
 
 def pictures(shown: Shown, folder: Path, *, waits: bool = False) -> Pictures:
-    """Return the store of photographs; ``waits``: the loop waits for the disk."""
+    """Return the store of photographs; with ``waits``, the loop waits for the disk."""
     disk = None if waits else DiskThread()
     return Pictures(folder / "photographs", shown.photographs, disk)
 
 
 @contextlib.asynccontextmanager
 async def archive(live: PlantAssembly, shown: Shown) -> AsyncIterator[None]:
-    """Archive the telemetry of the field during a block, if there is a folder."""
+    """Archive the field's telemetry during a block, if there is a folder."""
     if shown.data is None:
         yield
         return
@@ -320,10 +320,10 @@ async def archive(live: PlantAssembly, shown: Shown) -> AsyncIterator[None]:
 
 
 class Lines:
-    """The printed lines of a plant at work, printed by a thread.
+    """The printed lines of a plant in operation, which a thread prints.
 
-    The reader of the lines may be slow, such as a full pipe or a busy disk, or may have gone. Lines
-    are then lost, and the plant continues.
+    The reader of the lines may be slow (a full pipe, a busy disk) or may have gone. Lines are then
+    lost, and the plant continues.
     """
 
     def __init__(self) -> None:
@@ -335,7 +335,7 @@ class Lines:
             self._thread.do(lambda: print(text, flush=True), lambda _: None)
 
     def close(self) -> None:
-        """Print the queued lines, and end."""
+        """Print the queued lines, and end the thread."""
         self._thread.close(2.0)
 
 
@@ -361,9 +361,9 @@ class Entry:
     Attributes
     ----------
     password
-        Text that tells how to find its new password; "" if there is none.
+        Text that says how to find the account's new password; "" if there is none.
     by_link
-        Whether by a one-time link.
+        Whether the user signs in through a one-time link.
     """
 
     password: str = ""
@@ -379,7 +379,7 @@ async def interface(
     entry: Entry,
     lines: Lines,
 ) -> AsyncIterator[None]:
-    """Serve the plant's local interface during a block, and the console in a process beside it."""
+    """Serve the plant's local interface during a block, and run the console in its own process."""
     served = PlantInterface(live.operations, keeper.people, folder)
     if not shown.console:
         async with served.running():
@@ -403,10 +403,11 @@ async def interface(
 
 
 def first_account(live: PlantAssembly, keeper: Keeper, shown: Shown, folder: Path) -> Entry:
-    """Return how a user signs in to the first account; no text if it already has a password.
+    """Return how a user signs in to the first account, which may need a new password.
 
-    At a simulated plant that only this machine reaches it is a one-time link. The account is
-    written to the store, which may be slow, so this comes before the plant begins.
+    There is no text if the account already has a password. At a simulated plant that only this
+    computer can reach, the user signs in through a one-time link. The account is written to the
+    store, which may be slow, so this is done before the plant starts.
     """
     if not shown.console:
         return Entry()
@@ -422,7 +423,7 @@ def first_account(live: PlantAssembly, keeper: Keeper, shown: Shown, folder: Pat
 async def watch(
     live: PlantAssembly, shown: Shown, asked: asyncio.Event, lines: Lines, *, speed: float = 1.0
 ) -> None:
-    """Print a line at intervals until the end."""
+    """Print a line at intervals until the plant is to end."""
     loop = asyncio.get_running_loop()
     pause = speed * shown.every * (_SELDOM if shown.console and shown.every == EVERY else 1.0)
     await first_of(live.operations.begun.wait(), asked.wait())
@@ -436,9 +437,9 @@ async def watch(
 
 
 async def stow(live: PlantAssembly, at_once: asyncio.Event, lines: Lines) -> bool:
-    """Stow the field, and say how long that takes; return whether all of it is stowed.
+    """Stow the field, printing the expected time; return whether all heliostats are stowed.
 
-    It is given up when ``at_once`` is set.
+    Stowing is abandoned when ``at_once`` is set.
     """
     stowing = asyncio.ensure_future(live.stowed())
     waiting = asyncio.ensure_future(at_once.wait())
@@ -459,7 +460,7 @@ async def stow(live: PlantAssembly, at_once: asyncio.Event, lines: Lines) -> boo
 
 
 def _on_the_way(live: PlantAssembly) -> str:
-    """Return the count, states and remaining time of heliostats on their path to stow, or ""."""
+    """Return the number, states and remaining time of heliostats on their way to stow, or ""."""
     by_state, seconds = live.to_stow()
     if not by_state:
         return ""
@@ -471,7 +472,7 @@ def _on_the_way(live: PlantAssembly) -> str:
 
 
 def line(live: PlantAssembly) -> str:
-    """Return one line about a plant: what it does, what comes next, and at what pace."""
+    """Return one line about a plant: its activity, what comes next, and its pace."""
     summary, work = live.operations.summary(), live.operations.automatic.view()
     counts = dict(summary.states)
     tracking = counts.pop("TRACKING", 0)
@@ -503,7 +504,7 @@ def _calibrated_today(live: PlantAssembly) -> int:
 
 
 def _error(work: CalibrationView) -> str:
-    """Return the median error of the calibrated heliostats: the true one, where it is known."""
+    """Return the median error of the calibrated heliostats; the true error, if it is known."""
     if not work.quality:
         return ""
     last = work.quality[-1]
@@ -513,17 +514,17 @@ def _error(work: CalibrationView) -> str:
 
 
 def _mirrors(run: Running) -> str:
-    """Return the heliostats of a visit."""
+    """Return the heliostats of a visit in words."""
     return f"{run.heliostat} and {len(run.others)} more" if run.others else run.heliostat
 
 
 def pace(rate: float) -> str:
-    """Return how fast simulated time runs, in words; "" at the pace of real time."""
+    """Return the pace of simulated time in words; "" if it is the pace of real time."""
     return "" if abs(rate - 1.0) < _SLOWER else f"simulated at {rate:.2g} × real time"
 
 
 def _silent(live: PlantAssembly) -> str:
-    """Return the silent clusters, and the reason of the first."""
+    """Return the silent clusters, and the reason for the first cluster's silence."""
     rows = live.operations.logbook.cluster_rows(live.operations.plant)
     away = [row for row in rows if not row.alive]
     names = ", ".join(row.name for row in away[:3]) + (", …" if len(away) > 3 else "")
@@ -532,7 +533,7 @@ def _silent(live: PlantAssembly) -> str:
 
 
 def begin(design: Plant, shown: Shown) -> Ending:
-    """Print what begins and check the console; return what ends it.
+    """Print the name and size of the plant, and check the console; return the `Ending`.
 
     Raises
     ------
@@ -555,18 +556,18 @@ async def at_work(
     stows: bool,
     speed: float = 1.0,
 ) -> None:
-    """Run a plant with interface, console and archive until the end.
+    """Run a plant with its local interface, console and archive until it is to end.
 
-    The sockets of the interface stand in ``folder``. With ``stows`` the field is stowed before the
-    end, as every real one is.
+    The sockets of the interface are in ``folder``. With ``stows``, the field is stowed before the
+    end, as every real field is.
     """
     entry = first_account(live, keeper, shown, folder)
-    # Freeze the existing objects: every ten seconds the collector would walk through those of
-    # 10,000 heliostats and hold the loop for up to a second.
+    # Freeze the existing objects; otherwise the collector would visit the objects of 10,000
+    # heliostats every ten seconds and block the loop for up to a second.
     gc.freeze()
     gc.set_threshold(*_COLLECTED)
     with contextlib.closing(Lines()) as lines:
-        # The archive opens its folder before the plant begins, and is closed after its end.
+        # The archive opens its folder before the plant starts, and is closed after it ends.
         async with (
             archive(live, shown),
             live.running(),

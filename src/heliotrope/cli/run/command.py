@@ -1,4 +1,4 @@
-"""``heliotrope run``: a plant at work with its console until Ctrl-C, simulated or real."""
+"""``heliotrope run``: a simulated or real plant in operation, with its console."""
 
 import contextlib
 from enum import StrEnum
@@ -19,14 +19,14 @@ _CONSOLE, _KEPT = "Console", "Records"
 
 
 class Begin(StrEnum):
-    """How a simulated field begins."""
+    """The initial state of a simulated field."""
 
     SECOND_DAY = "second-day"
     NEW = "new"
     STOW = "stow"
 
 
-#: Most mirrors that were measured yesterday, of at most 15 % of the field.
+#: Maximum number of heliostats measured yesterday; at most 15 % of the field.
 _MEASURED = 1500
 
 
@@ -34,7 +34,7 @@ class GroupedCommand(TyperCommand):
     """A command whose help shows its options under headings."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write arguments, then the options of each heading."""
+        """Write the arguments, then the options under their headings."""
         for heading, params in groupby(self.get_params(ctx), _heading):
             rows = [row for row in (param.get_help_record(ctx) for param in params) if row]
             if rows:
@@ -322,11 +322,12 @@ def run(
         ),
     ] = 4.0,
 ) -> None:
-    """Run a plant: it tracks, photographs, learns and corrects; by default in simulation.
+    """Run a plant that tracks, photographs, learns and corrects; by default in simulation.
 
     The field leaves stow some heliostats at a time, the camera of each target calibrates one
     heliostat after another, and every calibration is pushed to its local controller. The console
-    shows it all. Ctrl-C ends it. With --clusters the heliostats are real, and it stows them first.
+    shows all this. Ctrl-C ends the plant. With --clusters the heliostats are real, and Ctrl-C stows
+    them first.
     """
     one_plant("run", field, heliostats, prototype=prototype)
     with contextlib.ExitStack() as stack:
@@ -342,7 +343,7 @@ def run(
             options = _options(field, heliostats, prototype=prototype)
             options += ["--speed", str(speed), "--start", begins.isoformat(), *["--up"] * up]
             measured = 0 if begin is Begin.NEW or prototype else _measured(len(design))
-            # It begins while the plant's program is loaded.
+            # The field starts while the plant program is being loaded.
             twin = stack.enter_context(twin_process(options, seed, measured))
         from heliotrope.cli.run._evidence import Evidence
         from heliotrope.cli.run._shared import Shown
@@ -396,7 +397,7 @@ def _kept(days: float, gigabytes: float) -> tuple[float, float, float]:
 
 
 def _measured(heliostats: int) -> int:
-    """Return how many mirrors were measured yesterday."""
+    """Return how many heliostats were measured yesterday."""
     return min(_MEASURED, heliostats * 3 // 20)
 
 
@@ -410,7 +411,7 @@ def _options(field: Path | None, heliostats: int | None, *, prototype: bool) -> 
 
 
 def _only_real(**simulated: bool) -> None:
-    """Refuse options of a simulation, by name, for a real plant."""
+    """Refuse options of a simulation for a real plant, and name them."""
     options = ", ".join(f"--{name}" for name, used in simulated.items() if used)
     if options:
         raise InputError(

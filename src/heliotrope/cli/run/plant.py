@@ -1,8 +1,8 @@
 """A plant with its store, its local interface and its console.
 
-There is one path for a real field and a simulated one: both are reached by a links file. The links
-file of a simulated field names its address; the plant then follows its clock, and asks it for the
-true errors.
+Real and simulated fields are treated alike: both are reached through a links file. The links file
+of a simulated field contains the field's address; the plant then follows the field's clock, and
+requests the true errors from it.
 """
 
 import asyncio
@@ -57,11 +57,11 @@ if TYPE_CHECKING:
 
 #: Calibration of a simulated field: how well its beams are known, rad.
 _SIMULATED = replace(CYCLE, sigma=2e-4)
-#: Time between true errors of a simulated field, s.
+#: Time between requests for the true errors of a simulated field, s.
 _TRUE_EVERY = 5.0
 
 
-#: Prepares store and simulated field.
+#: Function that prepares the store and the simulated field.
 Prepare = Callable[[Keeper, Plant, datetime], Awaitable[None]]
 
 
@@ -69,7 +69,8 @@ Prepare = Callable[[Keeper, Plant, datetime], Awaitable[None]]
 class PlantChoice:
     """Options of a plant on the command line; see `cli.run.command`.
 
-    ``aimed``: the heliostats of a simulated field track the design's aims when the plant begins.
+    ``aimed`` means that the heliostats of a simulated field track the design's aims when the plant
+    starts.
     """
 
     folder: Path
@@ -83,17 +84,18 @@ class PlantChoice:
 def run_plant(
     design: Plant, choice: PlantChoice, shown: Shown, prepare: Prepare | None = None
 ) -> None:
-    """Run until Ctrl-C, or until the time is over; a real field is stowed at the end.
+    """Run a plant until Ctrl-C or until its time has passed; stow a real field at the end.
 
-    ``prepare`` is called with store, plant and present time before a simulated field begins.
+    ``prepare`` is called with the store, the plant and the present time before a simulated field
+    starts.
 
     Raises
     ------
     InputError
-        If files do not fit together, a group lacks the machine table that ``--configure``
-        needs, or there is no place for records.
+        If files contradict each other, a group lacks the machine table that ``--configure`` needs,
+        or there is no place for records.
     FetchError
-        If the simulated field does not answer.
+        If the simulated field does not respond.
     """
     log_lines.install()
     file = _links_file(choice)
@@ -115,7 +117,7 @@ def _begin(
     loop: FollowedLoop | None = None,
     prepare: Prepare | None = None,
 ) -> None:
-    """Check everything, and run the plant in its loop."""
+    """Check all options, and run the plant in its loop."""
     if outside.links.light is not None:
         check_reference(design, outside.links.light)
     if choice.configure:
@@ -137,7 +139,7 @@ def _begin(
 
 
 def _papers(outside: "_Outside", shown: Shown) -> "Papers":
-    """Return keys and certificates of the links, and the certificate of the console."""
+    """Return the keys and certificates of the links, and the console's certificate."""
     papers = outside.links.papers
     if shown.console and shown.certificate is not None:
         papers.watch_end(shown.certificate)
@@ -157,7 +159,7 @@ def _settings(
             witnesses=outside.links.witnessed,
             firmware=outside.links.firmware,
         ),
-        # A heliostat that a person gives to automatic control is calibrated too.
+        # A heliostat that an operator hands to automatic control is calibrated too.
         work=AutomaticSettings(wanted=not choice.idle, foresee=FORESEE),
         cycle=CYCLE if outside.reader is None else _SIMULATED,
         machines=MachineTables.WRITTEN if choice.configure else held,
@@ -167,7 +169,7 @@ def _settings(
 def _check(
     design: Plant, settings: AssemblySettings, outside: "_Outside", cameras: RealCameras | None
 ) -> None:
-    """Build the whole plant without starting it, and print what it consists of."""
+    """Assemble the whole plant without starting it, and print a summary of its parts."""
     sensors = outside.sensors(cameras, design)
     ports = Ports(outside.all_links, outside.clock, Forgetful(), cameras, sensors)
     PlantAssembly(design, ports, settings)
@@ -183,12 +185,12 @@ def _check(
 
 @dataclass(frozen=True)
 class _Outside:
-    """Links of a plant, its clock, and the clusters that run in its process.
+    """A plant's links and clock, and the clusters that run in its process.
 
     Attributes
     ----------
     reader
-        Of the clock of a simulated field; None for a real one.
+        Reader of a simulated field's clock; None for a real field.
     """
 
     links: "PlantLinks"
@@ -198,7 +200,7 @@ class _Outside:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Run servers, links and local clusters for the time of a block."""
+        """Run servers, links and local clusters during a block."""
         parts = [
             *self.links.parts,
             *(part for local in self.local for part in local.parts),
@@ -236,7 +238,7 @@ class _Outside:
             cameras,
             self.sensors(cameras, design),
             witnesses=self.links.witnesses,
-            # A record takes long in a time that runs faster, so there the loop waits for it.
+            # If time runs faster, a record takes long in that time, so the loop waits for it.
             disk=None if self.fast else DiskThread(),
             records=keeper,
             assigned=KeptPoints(keeper),
@@ -250,11 +252,11 @@ class _Outside:
 
     @property
     def fast(self) -> bool:
-        """Whether the time of a simulated field runs faster than this machine's."""
+        """Whether a simulated field's time runs faster than this computer's time."""
         return self.reader is not None and self.reader.state.asked > 1.0
 
     def facts(self) -> dict[str, Any]:
-        """Return rows of the summary: of the links, and of the clock of a simulated field."""
+        """Return summary rows about the links and the clock of a simulated field."""
         found: dict[str, Any] = dict(self.links.facts())
         if self.reader is not None:
             found |= {"speed": self.reader.state.asked, "pace": self.reader.pace}
@@ -262,9 +264,9 @@ class _Outside:
 
 
 class _TrueErrors:
-    """The true tracking errors of a simulated field, asked for beside the loop.
+    """The true tracking errors of a simulated field, which are requested outside the loop.
 
-    Calling it returns the last ones, rad, (N,); NaN before the first.
+    A call returns the last errors, rad, (N,); NaN before the first reply.
     """
 
     def __init__(self, reader: ClockReader, design: Plant) -> None:
@@ -274,7 +276,7 @@ class _TrueErrors:
         self._asked_at = -np.inf
 
     def __call__(self) -> FloatArray:
-        """Return the last errors, and ask for others if these are old."""
+        """Return the last errors, and request new errors if these are old."""
         loop = asyncio.get_running_loop()
         if self._asking is None and loop.time() - self._asked_at > _TRUE_EVERY:
             self._asked_at = loop.time()
@@ -352,7 +354,7 @@ async def _run(
                 papers.renew(name, [file], local.installation.take_bus_keys)
         speed = 1.0 if outside.reader is None else outside.reader.state.asked
         if shown.console and shown.certificate is not None:
-            # The console takes it; here its change is only noted.
+            # The console loads the certificate; here only its change is recorded.
             papers.renew("certificate of the console", [shown.certificate], lambda: None)
 
         def note(name: str) -> None:

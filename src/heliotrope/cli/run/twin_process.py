@@ -1,4 +1,4 @@
-"""The simulated field that `heliotrope run` starts where no links are given."""
+"""The simulated field that `heliotrope run` starts if no links are specified."""
 
 import contextlib
 import shutil
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
     from heliotrope.field.plant import Plant
     from heliotrope.store.keeper import Keeper
 
-#: Time that it gets to end, s.
+#: Time allowed for the process to end, s.
 _ENDING = 1.0
 _MAIN = "from heliotrope.cli import main; main()"
 
 
 @dataclass(frozen=True)
 class TwinField:
-    """A simulated field that begins, and then waits for what its local controllers store.
+    """A simulated field that starts, then waits for the items that its local controllers store.
 
     Attributes
     ----------
     folder
-        Of its plant file and links file.
+        Folder of the field's plant file and links file.
     process
-        The simulated field.
+        The process of the simulated field.
     seed, measured
         See `twin_process`.
     """
@@ -44,19 +44,19 @@ class TwinField:
     measured: int
 
     def wait(self) -> None:
-        """Wait until its files are written, and its clock can be read.
+        """Wait until the field's files are written and its clock can be read.
 
         Raises
         ------
         InputError
-            If it does not begin.
+            If the field does not start.
         """
         assert self.process.stdout is not None
         if self.process.stdout.readline().strip() != READY:
             raise InputError("run: the simulated field did not start; see the line above")
 
     async def begin(self, keeper: "Keeper", design: "Plant", start: datetime) -> None:
-        """Let the field store what the plant has kept; a new store gets yesterday's calibrations.
+        """Let the field store the plant's calibrations; a new store gets yesterday's calibrations.
 
         Raises
         ------
@@ -78,16 +78,16 @@ class TwinField:
 
 @contextlib.contextmanager
 def twin_process(options: Sequence[str], seed: int, measured: int) -> Iterator["TwinField"]:
-    """Run a simulated field beside a block; yield it while it begins.
+    """Run a simulated field during a block; yield it while it is starting.
 
     Parameters
     ----------
     options
-        Of ``heliotrope twin``, without folder, addresses and seed.
+        Options of ``heliotrope twin``, without folder, addresses and seed.
     seed
-        Of how the mirrors really stand.
+        Seed of the true installation errors.
     measured
-        Number of mirrors that were measured yesterday, if the store has no calibration.
+        Number of heliostats measured yesterday, if the store has no calibration.
     """
     home = Path(tempfile.mkdtemp(prefix="heliotrope-twin-"))
     folder = home / "field"
@@ -95,7 +95,7 @@ def twin_process(options: Sequence[str], seed: int, measured: int) -> Iterator["
         port = server.getsockname()[1]
     command = [sys.executable, "-c", _MAIN, "twin", *options, "--folder", str(folder)]
     command += ["--seed", str(seed), "--plant", f"127.0.0.1:{port}", "--child"]
-    # In a session of its own: Ctrl-C in the terminal is the plant's.
+    # In a session of its own, because Ctrl-C in the terminal is meant for the plant.
     process = subprocess.Popen(  # noqa: S603
         command,
         stdin=subprocess.PIPE,
@@ -106,7 +106,7 @@ def twin_process(options: Sequence[str], seed: int, measured: int) -> Iterator["
     try:
         yield TwinField(folder, process, seed, measured)
     finally:
-        # It ends when its standard input ends.
+        # The process ends when its standard input ends.
         assert process.stdin is not None
         assert process.stdout is not None
         process.stdin.close()

@@ -5,7 +5,7 @@ Kernels are plain functions without annotations, compiled by numba with the opti
 inner loop. Their docstrings list their arguments; the typed functions that call them check the
 arguments. A kernel takes arrays with one batch axis and writes rows ``start`` to ``stop`` of its
 outputs, so that `heliotrope.parallel.run_blocks` can spread the rows over threads. Inside the
-kernels vectors are tuples of floats, which stay in registers.
+kernels, vectors are tuples of floats, which stay in registers.
 
 Kernels in other packages may call these functions directly; numba compiles them into the caller.
 

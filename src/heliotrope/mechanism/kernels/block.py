@@ -1,4 +1,4 @@
-"""Compiled: tracking of many rows, with stops, counts and branch selection."""
+"""Compiled: tracking of many heliostats or times, with stops, counts and branch selection."""
 
 import math
 
@@ -57,7 +57,7 @@ STOP_SLACK = 1e-9
 
 @njit(**INLINED)
 def stop_angles(d):
-    """Lowest and highest joint angle that both kinds of stops of drive ``d`` allow."""
+    """Return the lowest and highest joint angle that all stops of drive ``d`` allow."""
     if d[KIND] == LINEAR or math.isfinite(d[MIN_COUNT]) or math.isfinite(d[MAX_COUNT]):
         return _count_stops(d)
     return d[MIN_ANGLE], d[MAX_ANGLE]
@@ -65,7 +65,7 @@ def stop_angles(d):
 
 @njit(**INLINED)
 def _counts(d, theta):
-    """Counts at a joint angle; the plain rotary drive without a call."""
+    """Return the counts at a joint angle, without a function call for a plain rotary drive."""
     if d[KIND] == ROTARY and d[WORM_COS] == 0.0 and d[WORM_SIN] == 0.0 and d[SAG] == 0.0:
         return ((theta - d[BIAS]) / (1.0 + d[SCALE]) - d[ZERO]) / d[RATE]
     return drive_counts(d, theta)
@@ -94,7 +94,10 @@ def _count_stops(d):
 
 @njit(**INLINED)
 def into_stops(theta, stops, near):
-    """Return (angle, inside): theta + 2πk within the stops nearest to ``near``, or a stop."""
+    """Return theta + 2πk within the stops and nearest to ``near``, and whether it is inside.
+
+    If no such angle lies within the stops, the nearer stop is returned.
+    """
     turn = 2.0 * math.pi
     low, high = stops
     theta += turn * math.floor((near - theta) / turn + 0.5)
@@ -104,7 +107,7 @@ def into_stops(theta, stops, near):
         theta -= turn * math.ceil((theta - high - STOP_SLACK) / turn)
     if low - STOP_SLACK <= theta <= high + STOP_SLACK:
         return min(max(theta, low), high), True
-    # Neither a turn more nor a turn less lies within: the nearer stop.
+    # Neither one turn more nor one turn less lies within the stops, so take the nearer stop.
     above = theta - turn * math.floor((theta - high) / turn)
     below = above - turn
     if above - high < low - below:
@@ -119,7 +122,7 @@ def _turn(theta_1, theta_2):
 
 @njit(**INNER)
 def _free_angle(g, axis, held, u, v, stops, near):
-    """Best angle of the other joint while joint ``axis`` is held, within its stops."""
+    """Return the best angle of the other joint within its stops, with joint ``axis`` held."""
     if axis == 0:
         x = about(axis_1(g), -math.sin(held), math.cos(held), v)
         sine, cosine = turn_between(axis_2(g), u, x)
@@ -131,7 +134,7 @@ def _free_angle(g, axis, held, u, v, stops, near):
 
 @njit(**INNER)
 def _along_stop(g, s, p, u, v, local, axis, held, stops, near):
-    """Nearest pose with joint ``axis`` held at a stop; returns (residual, θ₁, θ₂)."""
+    """Find the nearest pose with joint ``axis`` held at a stop: (residual, θ₁, θ₂)."""
     other = 1 - axis
     free, v_here = 0.0, v
     theta_1, theta_2, t = held, 0.0, _turn(held, 0.0)
@@ -152,7 +155,7 @@ def _along_stop(g, s, p, u, v, local, axis, held, stops, near):
 
 @njit(**INNER)
 def _nearest_at_stops(g, s, p, u, v, local, stops, near):
-    """Nearest pose on the border of the stops' rectangle: (residual, θ₁, θ₂)."""
+    """Find the nearest pose on the border of the range between the stops: (residual, θ₁, θ₂)."""
     best, theta_1, theta_2 = np.inf, 0.0, 0.0
     for axis in range(1 if is_single(g) else 2):
         for side in range(2):
@@ -205,7 +208,7 @@ def _home(stops):
 
 @njit(**INNER)
 def _better(status, residual, seconds, radians):
-    """Whether the second branch is to be preferred to the first."""
+    """Return whether the second branch is preferable to the first."""
     if status[0] == OK and status[1] == OK:
         return (seconds[1], radians[1]) < (seconds[0], radians[0])
     if status[0] == OK or status[1] == OK:
@@ -239,8 +242,9 @@ def track_block(
 ):
     """Track rows ``start`` to ``stop``.
 
-    ``index`` (M, 5): rows of armatures, drives, suns, aims and current counts
-    (−1: none). ``branch`` 0 or 1 solves that one into the only place, 2 both.
+    ``index`` (M, 5) contains row indices of armatures, drives, sun vectors, aims and current counts
+    (−1: none). With ``branch`` 0 or 1 only that branch is solved, and the outputs have one place;
+    with 2 both branches are solved.
     """
     axes = drives.shape[1]
     seconds, radians = np.zeros(2), np.zeros(2)

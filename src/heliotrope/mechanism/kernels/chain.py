@@ -1,7 +1,7 @@
 """Compiled: forward kinematics of the joint chain, and the screw Jacobian.
 
-One chain is (position (3,), orientation (3, 3), axes (J, 3), origins (J, 3), angles (J,), drives
-(D, S), driven (D,), vertex (3,), normal (3,)). Rotating joint j by a small angle rotates everything
+A chain is (position (3,), orientation (3, 3), axes (J, 3), origins (J, 3), angles (J,), drives (D,
+S), driven (D,), vertex (3,), normal (3,)). Rotating joint j by a small angle rotates everything
 beyond the joint about the line through o_j along w_j. Hence for an angle parameter dn = w × n and
 dm = w × (m − o); for an offset parameter dm is the offset direction rotated into the current pose;
 a drive parameter enters through dθ/dp.
@@ -31,7 +31,7 @@ from heliotrope.mechanism.kernels.slots import (
 
 @njit(**INNER)
 def turn(matrix, axis, angle, out):
-    """out = matrix · Rot(axis, angle), with the axis in the frame of ``matrix``."""
+    """Set out = matrix · Rot(axis, angle), with the axis in the frame of ``matrix``."""
     x, y, z = axis[0], axis[1], axis[2]
     sine = math.sin(angle)
     half = math.sin(0.5 * angle)
@@ -75,11 +75,10 @@ def chain_pose(
     n,
     m,
 ):
-    """Place a chain whose driven joints are at ``joint_angles`` (D,).
+    """Compute the pose of a chain whose driven joints are at ``joint_angles`` (D,).
 
-    Fills frames (J + 1, 3, 3) (the orientation before each joint, and of the
-    mirror), screw_axes (J, 3) and screw_points (J, 3) in ENU, normal n (3,) and
-    vertex m (3,).
+    The outputs are frames (J + 1, 3, 3), which are the orientations before each joint and of the
+    mirror, screw_axes (J, 3) and screw_points (J, 3) in ENU, normal n (3,) and vertex m (3,).
     """
     joints = axes.shape[0]
     for i in range(3):
@@ -122,7 +121,10 @@ def _screw(axis, point, n, m, factor, dn, dm):
 def chain_derivative(
     what, index, sub, drives, driven, counts, frames, screw_axes, screw_points, n, m, dn, dm
 ):
-    """Derivative of normal and vertex by one parameter (what, index, sub)."""
+    """Compute the derivatives of normal and vertex with respect to a parameter.
+
+    The parameter is (what, index, sub).
+    """
     if what == MOVES_JOINT:
         _screw(screw_axes[index], screw_points[index], n, m, 1.0, dn, dm)
     elif what == MOVES_DRIVE:
@@ -160,7 +162,7 @@ def pose_block(
     start,
     stop,
 ):
-    """Normals and vertices for counts (M, D) of mechanisms ``rows`` (M,)."""
+    """Compute normals and vertices at counts (M, D) of the mechanisms ``rows`` (M,)."""
     joints = axes.shape[1]
     frames = np.empty((joints + 1, 3, 3))
     screw_axes, screw_points = np.empty((joints, 3)), np.empty((joints, 3))
@@ -210,7 +212,10 @@ def jacobian_block(
     start,
     stop,
 ):
-    """Poses with derivatives by the parameters ``codes`` (P, 3) and by the counts."""
+    """Compute poses with derivatives with respect to parameters and counts.
+
+    ``codes`` (P, 3) are the codes of the parameters.
+    """
     joints = axes.shape[1]
     frames = np.empty((joints + 1, 3, 3))
     screw_axes, screw_points = np.empty((joints, 3)), np.empty((joints, 3))
@@ -262,7 +267,7 @@ def jacobian_block(
 def armature_block(
     position, orientation, axes, origins, angles, driven, vertex, normal, out, start, stop
 ):
-    """Armatures (N, 18): axes, points, vertex and normal in ENU at zero joint angles."""
+    """Compute armatures (N, 18): axes, points, vertex and normal in ENU at zero joint angles."""
     joints = axes.shape[1]
     frames = np.empty((joints + 1, 3, 3))
     screw_axes, screw_points = np.empty((joints, 3)), np.empty((joints, 3))

@@ -28,7 +28,7 @@ from heliotrope.mechanism.kernels.slots import (
 
 @njit(**INLINED)
 def load_drive(table, i, k):
-    """Drive ``k`` of row ``i`` as a tuple, which lives in registers."""
+    """Return drive ``k`` of row ``i`` as a tuple, which stays in registers."""
     r = (table[i, k, 0], table[i, k, 1], table[i, k, 2], table[i, k, 3], table[i, k, 4])
     s = (table[i, k, 5], table[i, k, 6], table[i, k, 7], table[i, k, 8], table[i, k, 9])
     t = (table[i, k, 10], table[i, k, 11], table[i, k, 12], table[i, k, 13], table[i, k, 14])
@@ -37,7 +37,10 @@ def load_drive(table, i, k):
 
 @njit(**INNER)
 def count_range(d):
-    """Lowest and highest counts of drive row ``d``: its stops, and where a jack's triangle ends."""
+    """Return the lowest and highest counts of drive row ``d``.
+
+    They follow from its stops and from the ends of a jack's triangle.
+    """
     low, high = d[MIN_COUNT], d[MAX_COUNT]
     if d[KIND] == LINEAR:
         folded = (abs(d[OFFSET] - d[RADIUS]) - d[STROKE]) / d[RATE]
@@ -49,20 +52,20 @@ def count_range(d):
 
 @njit(**INNER)
 def triangle_angle(length, offset, radius):
-    """Angle at the joint of the triangle (offset, radius, length), clamped to [0, π]."""
+    """Return the triangle's angle at the joint, from (offset, radius, length), within [0, π]."""
     cosine = (offset * offset + radius * radius - length * length) / (2.0 * offset * radius)
     return math.acos(min(1.0, max(-1.0, cosine)))
 
 
 @njit(**INNER)
 def _triangle_slope(length, offset, radius):
-    """dΦ/dL of the triangle; infinite where it is stretched flat."""
+    """Return dΦ/dL of the triangle; infinite where the triangle is stretched flat."""
     return length / (offset * radius * math.sin(triangle_angle(length, offset, radius)))
 
 
 @njit(**INNER)
 def ideal_angle(d, counts):
-    """Angle φ of drive row ``d`` before bias, scale, worm and sag."""
+    """Return the angle φ of drive row ``d`` before bias, scale, worm and sag."""
     if d[KIND] == LINEAR:
         length = d[STROKE] + d[RATE] * counts
         return d[ZERO] + d[SENSE] * (
@@ -81,7 +84,7 @@ def _worm_argument(d, counts, phi):
 
 @njit(**INNER)
 def drive_angle(d, counts):
-    """Joint angle θ = bias + (1 + scale) φ + worm + sag of drive row ``d``."""
+    """Return the joint angle θ = bias + (1 + scale) φ + worm + sag of drive row ``d``."""
     phi = ideal_angle(d, counts)
     theta = d[BIAS] + (1.0 + d[SCALE]) * phi
     if d[WORM_COS] != 0.0 or d[WORM_SIN] != 0.0:
@@ -94,7 +97,7 @@ def drive_angle(d, counts):
 
 @njit(**INNER)
 def angle_per_ideal(d, counts, phi):
-    """Return (dθ/dφ with the worm's argument held, dθ/du of the worm)."""
+    """Return dθ/dφ at a constant worm argument, and dθ/du of the worm."""
     slope = 1.0 + d[SCALE] - d[SAG] * math.sin(phi + d[SAG_PHASE])
     worm = 0.0
     if d[WORM_COS] != 0.0 or d[WORM_SIN] != 0.0:
@@ -105,7 +108,7 @@ def angle_per_ideal(d, counts, phi):
 
 @njit(**INNER)
 def angle_per_count(d, counts):
-    """dθ/dcounts of drive row ``d``."""
+    """Return dθ/dcounts of drive row ``d``."""
     phi = ideal_angle(d, counts)
     slope, worm = angle_per_ideal(d, counts, phi)
     if d[KIND] == LINEAR:
@@ -117,7 +120,7 @@ def angle_per_count(d, counts):
 
 @njit(**INNER)
 def angle_per_slot(d, counts, slot):
-    """dθ/d(slot) of drive row ``d`` at constant counts."""
+    """Return dθ/d(slot) of drive row ``d`` at constant counts."""
     phi = ideal_angle(d, counts)
     if slot == BIAS:
         return 1.0
@@ -159,12 +162,12 @@ def angle_per_slot(d, counts, slot):
 
 @njit(**INNER)
 def _counts_of_ideal(d, phi):
-    """Counts at which the ideal angle is ``phi``; a jack's reach is clamped to its triangle."""
+    """Return the counts at which the ideal angle is ``phi``, clamped to a jack's triangle."""
     if d[KIND] == LINEAR:
         c, r = d[OFFSET], d[RADIUS]
         angle = triangle_angle(d[STROKE], c, r) - d[SENSE] * (phi - d[ZERO])
         angle = min(math.pi, max(0.0, angle))
-        # (c − r)² + 4 c r sin²(Φ/2) keeps the digits where the jack is folded.
+        # (c − r)² + 4 c r sin²(Φ/2) keeps its precision when the jack is folded.
         half = math.sin(0.5 * angle)
         length = math.sqrt((c - r) * (c - r) + 4.0 * c * r * half * half)
         return (length - d[STROKE]) / d[RATE]
@@ -173,10 +176,10 @@ def _counts_of_ideal(d, phi):
 
 @njit(**INNER)
 def drive_counts(d, theta):
-    """Counts of drive row ``d`` at joint angle ``theta``.
+    """Return the counts of drive row ``d`` at joint angle ``theta``.
 
-    Closed form without periodic terms; with them a bracketed Newton iteration in
-    counts, which cannot leave the bracket that the size of the terms gives.
+    Without periodic terms this is a closed form. With periodic terms it is a bracketed Newton
+    iteration in counts, which cannot leave the bracket that follows from the size of these terms.
     """
     phi = (theta - d[BIAS]) / (1.0 + d[SCALE])
     counts = _counts_of_ideal(d, phi)
@@ -203,7 +206,7 @@ def drive_counts(d, theta):
 
 @njit(**OPTIONS)
 def angles_block(drives, counts, rows, out, start, stop):
-    """θ of every drive: ``drives`` (N, D, S), ``counts`` (M, D), ``rows`` (M,)."""
+    """Return θ of every drive for ``drives`` (N, D, S), ``counts`` (M, D) and ``rows`` (M,)."""
     for i in range(start, stop):
         for k in range(counts.shape[1]):
             out[i, k] = drive_angle(load_drive(drives, rows[i], k), counts[i, k])
@@ -211,7 +214,7 @@ def angles_block(drives, counts, rows, out, start, stop):
 
 @njit(**OPTIONS)
 def counts_block(drives, angles, rows, out, start, stop):
-    """Counts of every drive, the inverse of `angles_block`."""
+    """Return the counts of every drive, the inverse of `angles_block`."""
     for i in range(start, stop):
         for k in range(angles.shape[1]):
             out[i, k] = drive_counts(load_drive(drives, rows[i], k), angles[i, k])
@@ -219,7 +222,7 @@ def counts_block(drives, angles, rows, out, start, stop):
 
 @njit(**OPTIONS)
 def slopes_block(drives, counts, rows, out, start, stop):
-    """dθ/dcounts of every drive."""
+    """Return dθ/dcounts of every drive."""
     for i in range(start, stop):
         for k in range(counts.shape[1]):
             out[i, k] = angle_per_count(load_drive(drives, rows[i], k), counts[i, k])

@@ -8,8 +8,8 @@ iteration, then, where that converges slowly, Newton's method with the screw der
 by Levenberg damping.
 
 Everything is a tuple of floats: an armature ``g`` of 18, a vector of 3, and a rotation ``t`` = (sin
-θ₁, cos θ₁, sin θ₂, cos θ₂). Array slices would update a shared reference count at every call and
-make the threads wait for each other.
+θ₁, cos θ₁, sin θ₂, cos θ₂). Array slices would update a shared reference count at every call, so
+that threads would wait for each other.
 """
 
 import math
@@ -36,21 +36,22 @@ UNREACHABLE = 1  # inside the dead cone around the primary axis
 STOPPED = 2  # beyond a stop
 NOT_CONVERGED = 3
 DEGENERATE = 4  # source opposite to aim, aim in the vertex, or a value not finite
-BEHIND = 5  # an aim fixed to the mirror that its front does not face
+BEHIND = 5  # an aim fixed to the mirror but not in front of it
 
-#: The fixed point is left for Newton when a step gains less than this factor.
+#: Newton replaces the fixed-point iteration if a step reduces the error by less than this factor.
 SLOW = 0.3
-#: Iterations of Newton, and trials of the damping in each.
+#: Maximum number of Newton iterations, and of damping trials in each iteration.
 NEWTON_LIMIT, DAMPING_LIMIT = 60, 30
-#: Steps of Gauss-Newton before the curvature of the gap itself is looked at.
+#: Number of Gauss-Newton steps before the curvature of n − v itself is included.
 PATIENCE = 8
-#: Source and aim closer to opposite than this (rad), or aim nearer to the vertex (m).
+#: A pose is degenerate if source and aim are closer to opposite than this (rad), or if the aim is
+#: nearer to the vertex than this (m).
 DEGENERATE_LIMIT = 1e-9
 
 
 @njit(**INLINED)
 def load_armature(table, i):
-    """Row ``i`` of armatures (N, 18) as a tuple."""
+    """Return row ``i`` of armatures (N, 18) as a tuple."""
     r = (table[i, 0], table[i, 1], table[i, 2], table[i, 3], table[i, 4], table[i, 5])
     s = (table[i, 6], table[i, 7], table[i, 8], table[i, 9], table[i, 10], table[i, 11])
     return (
@@ -69,28 +70,28 @@ def load_armature(table, i):
 
 @njit(**INLINED)
 def axis_1(g):
-    """Primary axis."""
+    """Return the primary axis."""
     return g[0], g[1], g[2]
 
 
 @njit(**INLINED)
 def axis_2(g):
-    """Secondary axis at zero primary angle; of zero length if there is none."""
+    """Return the secondary axis at zero primary angle; it has zero length if there is none."""
     return g[6], g[7], g[8]
 
 
 @njit(**INLINED)
 def is_single(g):
-    """Whether there is no secondary axis."""
+    """Return whether there is no secondary axis."""
     return g[6] == 0.0 and g[7] == 0.0 and g[8] == 0.0
 
 
 @njit(**INLINED)
 def constants(g, u):
-    """Constants of the solution for mirror vector ``u``, the same in all steps.
+    """Return the constants of the solution for mirror vector ``u``, the same in all steps.
 
-    With z = α a + β b + γ c and c = a × b, sine and cosine of θ₂ are linear in α and γ:
-    (a·b, u·b, 1/|c|², sine by α and γ, cosine by α and γ).
+    With z = α a + β b + γ c and c = a × b, sine and cosine of θ₂ are linear in α and γ. The
+    constants are (a·b, u·b, 1/|c|², coefficients of α and γ in the sine, and in the cosine).
     """
     a, b = axis_1(g), axis_2(g)
     if is_single(g):
@@ -105,7 +106,7 @@ def constants(g, u):
 
 @njit(**INLINED)
 def solve_direction(g, k, u, v, sign):
-    """Turn both joints so that ``u`` (given at zero angles) comes to lie along v.
+    """Rotate both joints so that ``u`` (specified at zero angles) is parallel to v.
 
     ``k`` are the `constants` of u. Returns (whether v was reached, t). Inside
     the dead cone the pose is the nearest.
@@ -140,7 +141,7 @@ def solve_direction(g, k, u, v, sign):
 
 @njit(**INLINED)
 def turned(g, t, u):
-    """Vector ``u`` of the mirror (given at zero angles) at turn t."""
+    """Return the mirror vector ``u`` (specified at zero angles) at turn t."""
     if not is_single(g):
         u = about(axis_2(g), t[2], t[3], u)
     return about(axis_1(g), t[0], t[1], u)
@@ -148,7 +149,7 @@ def turned(g, t, u):
 
 @njit(**INLINED)
 def place_vertex(g, t):
-    """Vertex at turn t."""
+    """Return the vertex at turn t."""
     r = (g[12] - g[9], g[13] - g[10], g[14] - g[11])
     if not is_single(g):
         r = about(axis_2(g), t[2], t[3], r)
@@ -158,9 +159,10 @@ def place_vertex(g, t):
 
 @njit(**INLINED)
 def served(g, s):
-    """The part of source direction s that the mechanism can serve: all, or that across its axis.
+    """Return the part of source direction s that the mechanism can reflect.
 
-    A zero vector if a single axis points at the source.
+    For two axes this is s itself, for a single axis the part perpendicular to the axis. It is a
+    zero vector if a single axis points at the source.
     """
     if not is_single(g):
         return s
@@ -173,10 +175,11 @@ def served(g, s):
 
 @njit(**INLINED)
 def wanted_normal(g, s, p, m):
-    """(bisector of s and the path from m to p, the path's direction, its length); 0 if none.
+    """Return the required normal, the direction from m to p, and the distance.
 
-    For a single axis the path is projected on the plane across it; s must be
-    `served` already.
+    The required normal is the bisector of s and that direction; the distance is 0 if there is none.
+    For a single axis the path is projected onto the plane perpendicular to it; s must be the result
+    of `served`.
     """
     path = minus(p, m)
     if is_single(g):
@@ -194,7 +197,10 @@ def wanted_normal(g, s, p, m):
 
 @njit(**INLINED)
 def mirror_normal(g, t):
-    """Normal at turn t; for a single axis its unit projection across the axis."""
+    """Return the normal at turn t.
+
+    For a single axis, this is its unit projection perpendicular to the axis.
+    """
     n = turned(g, t, (g[15], g[16], g[17]))
     if is_single(g):
         n = across(n, axis_1(g))
@@ -204,14 +210,17 @@ def mirror_normal(g, t):
 
 @njit(**INLINED)
 def beam_miss(s, path, distance, n):
-    """Distance (m) between the aim and the ray reflected with normal n."""
+    """Return the distance (m) between the aim and the ray reflected with normal n."""
     ray = minus(times(2.0 * dot(n, s), n), s)
     return distance * norm(cross(path, ray))
 
 
 @njit(**INLINED)
 def residual_angle(g, t, u, v):
-    """Angle between the turned ``u`` and v; in the plane across the axis if single."""
+    """Return the angle between the turned ``u`` and v.
+
+    For a single axis it is measured in the plane perpendicular to the axis.
+    """
     x = turned(g, t, u)
     if is_single(g):
         x = across(x, axis_1(g))
@@ -221,7 +230,7 @@ def residual_angle(g, t, u, v):
 
 @njit(**INNER)
 def _columns(g, t, n, m, k):
-    """(dn, dm) by joint angle k: the screw formula."""
+    """Return the derivatives (dn, dm) with respect to joint angle k: the screw formula."""
     if k == 0:
         w, o = axis_1(g), (g[3], g[4], g[5])
     else:
@@ -233,7 +242,7 @@ def _columns(g, t, n, m, k):
 
 @njit(**INNER)
 def _difference_column(g, t, n, m, v, path, distance, k):
-    """d(n − v) by joint angle k; the bisector v moves with the vertex."""
+    """Return d(n − v) with respect to joint angle k; the bisector v moves with the vertex."""
     dn, dm = _columns(g, t, n, m, k)
     if is_single(g):
         dm = across(dm, axis_1(g))
@@ -244,7 +253,7 @@ def _difference_column(g, t, n, m, v, path, distance, k):
 
 @njit(**INNER)
 def _gradient(g, s, p, theta_1, theta_2):
-    """Half the gradient of |n − v|² by the two joint angles."""
+    """Return half the gradient of |n − v|² with respect to the two joint angles."""
     t = (math.sin(theta_1), math.cos(theta_1), math.sin(theta_2), math.cos(theta_2))
     m = place_vertex(g, t)
     v, path, distance = wanted_normal(g, s, p, m)
@@ -259,10 +268,10 @@ def _gradient(g, s, p, theta_1, theta_2):
 
 @njit(**INNER)
 def _curvature(g, s, p, theta_1, theta_2):
-    """Half the second derivatives of |n − v|², by differences of its gradient.
+    """Return half the second derivatives of |n − v|², from differences of its gradient.
 
-    Where the gap cannot close, its own curvature counts as much as the squared first
-    derivatives, and Gauss-Newton creeps.
+    Where n − v cannot become zero, its own curvature matters as much as the squared first
+    derivatives, and Gauss-Newton would converge slowly.
     """
     h = 1e-5
     up_0, up_1 = _gradient(g, s, p, theta_1 + h, theta_2)
@@ -275,7 +284,7 @@ def _curvature(g, s, p, theta_1, theta_2):
 
 @njit(**INNER)
 def _newton(g, s, p, t, tolerance):
-    """Levenberg-damped Newton on |n − v|² from turn t; returns (status, iterations, t)."""
+    """Minimise |n − v|² from turn t with Levenberg-damped Newton: (status, iterations, t)."""
     theta_1, theta_2 = math.atan2(t[0], t[1]), math.atan2(t[2], t[3])
     damping = 1e-12
     m = place_vertex(g, t)
@@ -293,7 +302,7 @@ def _newton(g, s, p, t, tolerance):
         if iteration >= PATIENCE:
             c00, c01, c11 = _curvature(g, s, p, theta_1, theta_2)
             if math.isfinite(c00 + c01 + c11):
-                # On a saddle the lowest curvature is turned up: downhill on both axes.
+                # On a saddle the lowest curvature is made positive: downhill on both axes.
                 lowest = 0.5 * (c00 + c11) - math.hypot(0.5 * (c00 - c11), c01)
                 lift = max(0.0, -2.0 * lowest)
                 h00, h01, h11 = c00 + lift, c01, c11 + lift
@@ -321,7 +330,7 @@ def _newton(g, s, p, t, tolerance):
                         break
             damping = max(10.0 * damping, 1e-12)
         if not improved:
-            # A minimum with a remainder: no pose near here sends the beam to p.
+            # A minimum with a remainder means that no pose near here sends the beam to p.
             return UNREACHABLE, iteration, t
         settled = cost_new > 1e-24 and cost - cost_new < 1e-13 * cost_new
         theta_1, theta_2, t, m, n, cost = theta_1_new, theta_2_new, t_new, m_new, n_new, cost_new
@@ -339,8 +348,8 @@ def _newton(g, s, p, t, tolerance):
 def solve_aim(g, s, p, m, sign, tolerance, limit, newton):
     """Bring the beam of armature ``g`` from direction s (served) to point p on one branch.
 
-    ``m`` is the vertex to start from. Returns (status, iterations, t, vertex, normal,
-    residual); the last two hold where the status is OK.
+    ``m`` is the vertex to start from. Returns (status, iterations, t, vertex, normal, residual);
+    the normal and the residual are valid only if the status is OK.
     """
     u = (g[15], g[16], g[17])
     k = constants(g, u)
@@ -364,7 +373,7 @@ def solve_aim(g, s, p, m, sign, tolerance, limit, newton):
             # A miss turns the path by miss / distance and the bisector by that over |s + t|.
             residual = math.sqrt(square) / (distance * 2.0 * dot(v, path))
             if not reached:
-                # On the very edge rounding alone may say so: the beam decides.
+                # On the very edge rounding alone may decide this, so the beam is checked.
                 v, path, distance = wanted_normal(g, s, p, m)
                 reached = beam_miss(s, path, distance, mirror_normal(g, t)) <= tolerance
             return (OK if reached else UNREACHABLE), iteration, t, m, v, residual
@@ -379,10 +388,11 @@ def solve_aim(g, s, p, m, sign, tolerance, limit, newton):
 
 @njit(**INLINED)
 def local_direction(g, aim):
-    """Where the source must stand, at zero angles, to light point ``aim`` fixed to the mirror.
+    """Return the direction of a source, at zero angles, that lights ``aim`` fixed to the mirror.
 
-    It is the aim's direction reflected in the normal. Returns (status, direction): DEGENERATE if
-    the aim is in the vertex, BEHIND if it is not before the mirror.
+    It is the direction to the aim, reflected about the normal. Returns (status, direction); the
+    status is DEGENERATE if the aim is in the vertex, BEHIND if the aim is not in front of the
+    mirror.
     """
     n = mirror_normal(g, (0.0, 1.0, 0.0, 1.0))
     direction = served(g, minus(aim, (g[12], g[13], g[14])))

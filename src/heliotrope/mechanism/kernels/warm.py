@@ -1,9 +1,9 @@
 """Compiled: the first fixed-point steps of many heliostats at once, in vector registers.
 
-One step is a chain of four square roots and four divisions, each of which waits for the one before,
-so solving one heliostat at a time leaves the processor idle. Here the lanes of a small table hold
-several heliostats, and the same step runs on all lanes in parallel. The result is only a starting
-vertex; `track.solve_aim` continues from it and makes all decisions.
+One step is a chain of four square roots and four divisions, each of which waits for the previous
+one, so that solving one heliostat at a time leaves the processor idle. Here the lanes of a small
+table contain several heliostats, and the same step runs on all lanes in parallel. The result is
+only a starting vertex; `track.solve_aim` continues from it and makes all decisions.
 """
 
 import math
@@ -15,7 +15,7 @@ from heliotrope.jit import INLINED, INNER, plain
 from heliotrope.mechanism.kernels.track import axis_1, axis_2, constants, load_armature
 from heliotrope.mechanism.kernels.vectors import across, add, cross, dot, minus, times
 
-#: Heliostats side by side, and steps taken with them.
+#: Number of heliostats computed in parallel, and number of steps.
 LANES = 8
 STEPS = 3
 # Rows of the table: vectors take three.
@@ -59,7 +59,7 @@ def _gather(table, lane, g, s, p):
 
 @njit(**INLINED)
 def _step(w, sign):
-    """One fixed-point step of every lane: see ``solve_direction`` for the formulae."""
+    """Compute one fixed-point step of every lane; see ``solve_direction`` for the formulae."""
     for i in range(LANES):
         x = w[_AIM, i] - w[_Y, i]
         y = w[_AIM + 1, i] - w[_Y + 1, i]
@@ -94,13 +94,13 @@ def _step(w, sign):
 
 @njit(**INNER)
 def warm_start(armatures, suns, aims, index, first, stop, sign, vertices):
-    """Vertices (LANES, 3) to start rows ``first`` … from, after STEPS steps.
+    """Return starting vertices (LANES, 3) of the rows from ``first`` on, after STEPS steps.
 
-    Lanes past ``stop`` repeat the last row, so that a row comes out the same wherever
-    the blocks of rows are cut. What is not finite (no second axis, aim in the vertex)
+    Lanes past ``stop`` repeat the last row, so that the result for a row does not depend on where
+    the blocks of rows are cut. A row whose result is not finite (no second axis, aim in the vertex)
     starts at zero angles.
     """
-    # Made here, so that its shape is a constant of the compiler and the step becomes
+    # Created here, so that its shape is a constant for the compiler and the step becomes
     # vector instructions: 16 ns a step and heliostat instead of 90.
     table = np.empty((ROWS, LANES))
     for lane in range(LANES):

@@ -1,8 +1,9 @@
-"""A simulated heliostat board with the real firmware: an `lcu.node.Node` on simulated hardware.
+"""A simulated heliostat board that runs the real firmware.
 
-The board has flash, a millisecond counter, two motors with step timers, and a supply that may fail
-at any instant, even during a flash write. `Board` is a `Station` on a bus; `step` advances its
-time. A `Witness` sees all its actions without affecting them.
+The firmware is an `lcu.node.Node` on simulated hardware. The board has flash, a millisecond
+counter, two motors with step timers, and a supply that may fail at any instant, even during a flash
+write. `Board` is a `Station` on a bus; `step` advances its time. A `Witness` sees all its actions
+without affecting them.
 """
 
 import contextlib
@@ -25,9 +26,9 @@ from heliotrope.twin.boards.motors import MotorAxis
 from heliotrope.twin.boards.outfit import Outfit, sha256
 from heliotrope.twin.wind import Wind
 
-#: Longest intervals between two passes of the main loop: while steps are made; while the sun is
-#: followed; at rest. A real board loops far more often. The first is the worst that the core
-#: allows; the others save time.
+#: Longest intervals between two passes of the main loop: while making steps, while following the
+#: sun, and at rest. A real board loops far more often. The first interval is the longest that the
+#: core allows; the other two save computing time.
 MOVING, FOLLOWING, RESTING = 0.05, 0.1, 0.5
 
 
@@ -35,18 +36,18 @@ class Witness(Protocol):
     """An observer of a board's actions."""
 
     def acted(self, board: "Board", what: str, now: float) -> None:
-        """Note an action of a board: "bytes", "tick", "boot" or "cut"."""
+        """Record what a board has done: "bytes", "tick", "boot" or "cut" (power lost)."""
         ...
 
     def stepped(
         self, board: "Board", axis: int, direction: int, count: int, interval_us: int
     ) -> None:
-        """Note a segment that a board has sent to its timer."""
+        """Record a segment that a board has sent to its step timer."""
         ...
 
 
 class _Timer:
-    """The step timer that a node sees."""
+    """The step timer as the node sees it."""
 
     def __init__(self, board: "Board") -> None:
         self._board = board
@@ -72,13 +73,13 @@ class Board:
         The heliostat: name, addresses, mechanism, journal. The board may belong to another
         heliostat; see `exchange`.
     seed
-        Seed of flash, motors and random choices.
+        Seed of the flash, the motors and the random choices.
     ticks
-        Its millisecond counter.
+        The board's millisecond counter.
     play, miss
         Backlash and missed steps of the motors; see `MotorAxis`.
     wind
-        Wind that deflects the mirror; None: no wind.
+        Wind that deflects the mirror; None for no wind.
 
     Attributes
     ----------
@@ -87,11 +88,11 @@ class Board:
     axes
         Motors.
     slip
-        Position of the motors relative to the node's counts, steps: set at each boot, and by ZERO.
+        Position of the motors relative to the node's counts, steps; set at each boot and by ZERO.
     now
         True time of the last event, in s.
     tilt
-        Accelerometer reading, or None.
+        Accelerometer reading; None if there is no accelerometer.
     switched_off
         Whether the drives are switched off at the mirror.
     powered
@@ -135,7 +136,7 @@ class Board:
     # -- the supply --------------------------------------------------------------------
 
     def power_on(self, now: float) -> None:
-        """Boot, unless the board is running; flash may fail during the boot."""
+        """Boot the board unless it is already running; the flash may fail during the boot."""
         if self.node is not None:
             return
         self.now = now
@@ -163,18 +164,24 @@ class Board:
         self._tell("boot")
 
     def zeroed(self) -> None:
-        """Note that its step counts were declared, and how far the motors are from these counts."""
+        """Record that step counts were declared, and the motors' offset from these counts."""
         if self.node is not None:
             self._counts_from([self.node.controller.motion.place(axis) for axis in (0, 1)])
 
     def _counts_from(self, counts: Sequence[int]) -> None:
-        """Count steps anew from where the motors are: what was missed before is in the slip."""
+        """Restart the count of emitted steps at the motors' positions.
+
+        Steps missed earlier are contained in ``slip``.
+        """
         self.slip = [axis.turned - count for axis, count in zip(self.axes, counts, strict=True)]
         for axis in self.axes:
             axis.emitted = axis.turned
 
     def power_off(self, now: float, *, warned: bool = False) -> None:
-        """Cut the supply; ``warned``: the brown-out detector notices in time."""
+        """Cut the supply.
+
+        If ``warned``, the brown-out detector notices the failure in time.
+        """
         self._to(now)
         if self.node is None:
             return
@@ -184,14 +191,15 @@ class Board:
         self._die()
 
     def exchange(self, serial: int, items: Mapping[str, bytes] | NorFlash) -> NorFlash:
-        """Install another board at the heliostat, while power is off; return the old flash.
+        """Install another board at the heliostat while its power is off; return the old flash.
 
         Parameters
         ----------
         serial
             Serial number of the other board.
         items
-            Items that it stores, as if last at stow; or the flash of a board that was here before.
+            Items that the new board stores, with its counts set to stow; or the flash of a board
+            that was installed here before.
         """
         assert self.node is None
         before, self._serial = self.flash, serial
@@ -249,7 +257,7 @@ class Board:
     # -- events ------------------------------------------------------------------------
 
     def hear(self, data: bytes, now: float) -> bytes:
-        """Receive bytes from the bus; return the immediate reply."""
+        """Receive bytes from the bus and return the immediate reply."""
         self._to(now)
         if self.node is None:
             return b""
@@ -263,7 +271,7 @@ class Board:
         return self._spoken()
 
     def step(self, now: float) -> bytes:
-        """Run one pass of the main loop; return the bytes that it sends without a request."""
+        """Run one pass of the main loop and return the bytes that the board sends unrequested."""
         self._to(now)
         if self.node is None:
             return b""
@@ -283,7 +291,10 @@ class Board:
         return out
 
     def due(self, now: float) -> float:
-        """Return when the main loop should run next, in s; running earlier is always allowed."""
+        """Return the latest time at which the main loop should run next, in s.
+
+        Running earlier is always allowed.
+        """
         node = self.node
         if node is None:
             return math.inf
@@ -304,16 +315,16 @@ class Board:
 
     @property
     def controller(self) -> Controller | None:
-        """The controller, None while the supply is off."""
+        """The controller; None while the supply is off."""
         return None if self.node is None else self.node.controller
 
     @property
     def state(self) -> int:
-        """State of `lcu.states`, -1 while the supply is off."""
+        """State, one of `lcu.states`; -1 while the supply is off."""
         return -1 if self.node is None else self.node.controller.state
 
     def mirror(self, *, believed: bool = False) -> tuple[FloatArray, FloatArray]:
-        """Return vertex (3,), m, and unit normal (3,), at the time of the last event.
+        """Return the mirror's vertex and unit normal at the time of the last event.
 
         Parameters
         ----------
@@ -333,7 +344,7 @@ class Board:
         return vertex, self.wind.turned(normal, self.outfit.mechanism.position, self.now)
 
     def beam(self, sun: FloatArray, *, believed: bool = False) -> tuple[FloatArray, FloatArray]:
-        """Return vertex (3,) and direction (3,) of the reflected ray.
+        """Return the vertex of the mirror, (3,), m, and the direction of the reflected ray, (3,).
 
         Parameters
         ----------
@@ -348,7 +359,7 @@ class Board:
     def miss(
         self, sun: FloatArray, point: "tuple[float, float, float]", *, believed: bool = False
     ) -> float:
-        """Return the distance of the ray from a point, m; infinite if it leads away from it."""
+        """Return the distance of the reflected ray from a point, m; infinite if it leads away."""
         # Computed with scalars, because numpy takes several times as long for three numbers.
         vertex, normal = (vector.tolist() for vector in self.mirror(believed=believed))
         (a, b, c), (i, j, k), (s, t, u) = vertex, normal, sun.tolist()

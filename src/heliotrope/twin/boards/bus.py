@@ -1,8 +1,9 @@
 """A bus within this process: the cluster at one end, boards or a vectorised field at the other.
 
-It implements `links.link.Bus`: one transaction at a time, urgent frames next, and nothing after its
-expiry. Bytes take their transmission time at the baud rate. Faults are drawn from a seed and may be
-changed at any time (`BusFaults`). Everything connected to the bus is a `Station`.
+The bus implements `links.link.Bus`: it carries one transaction at a time, sends urgent frames next,
+and sends no frame after its expiry. Bytes take their transmission time at the baud rate. Faults are
+drawn from a seed and may be changed at any time (`BusFaults`). Everything connected to the bus is a
+`Station`.
 """
 
 import asyncio
@@ -25,7 +26,7 @@ class Station(Protocol):
     """A device connected to a bus."""
 
     def hear(self, data: bytes, now: float) -> bytes:
-        """Receive bytes at a time in s; return the immediate reply, or b""."""
+        """Receive bytes at a time in s; return the immediate reply, b"" if there is none."""
         ...
 
 
@@ -33,21 +34,24 @@ class Tap(Protocol):
     """A listener to all traffic that does not affect it."""
 
     def sent(self, frame: bytes, now: float) -> None:
-        """Note bytes that the master sent."""
+        """Record bytes that the master sent."""
         ...
 
     def heard(self, place: int, data: bytes, how: str, now: float) -> None:
-        """Note bytes that a station is about to receive: "whole", or with a named fault."""
+        """Record bytes that a station is about to receive.
+
+        ``how`` is "whole", or the name of the fault that affects the bytes.
+        """
         ...
 
     def answered(self, data: bytes, how: str, now: float) -> None:
-        """Note bytes that the master receives."""
+        """Record bytes that the master receives."""
         ...
 
 
 @dataclass(frozen=True)
 class BusFaults:
-    """Faults that a bus applies to frames, in either direction and for each station separately.
+    """Faults that the bus applies to frames, separately per direction and per station.
 
     Parameters
     ----------
@@ -56,7 +60,7 @@ class BusFaults:
         frame arrives twice; it arrives only when the next frame is sent (out of order, or between
         other frames); a reply is delayed, up to the timeout.
     stuck
-        Whether a transmitter blocks the line, so that nobody receives anything.
+        Whether a transmitter blocks the line, so that no device receives anything.
 
     Raises
     ------
@@ -89,7 +93,7 @@ class BusFaults:
 
 
 def damaged(data: bytes, chance: random.Random, *, burst: bool) -> bytes:
-    """Return bytes with one bit inverted, or with a run of up to eight of them replaced."""
+    """Return the bytes with one bit inverted, or with a run of up to eight bytes replaced."""
     out = bytearray(data)
     place = chance.randrange(len(out))
     if not burst:
@@ -106,17 +110,17 @@ class TwinBus:
     Parameters
     ----------
     clock
-        Clock of the bus; its monotonic time is that of the stations.
+        Clock of the bus; its monotonic time is also the stations' time.
     stations
         Devices that receive every frame.
     seed
         Seed of the faults.
     baud_rate
-        Bits per second; 0: bytes take no time.
+        Bits per second; at 0, bytes take no time.
     turn_around
-        Time from the end of a frame to the reply, in s.
+        Time from the end of a frame to the start of the reply, in s.
     tap
-        Listens to everything.
+        Listens to all traffic.
 
     Attributes
     ----------
@@ -192,7 +196,7 @@ class TwinBus:
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return the reply, or b"".
+        """Send a frame and return the reply; b"" if none arrives in time.
 
         Raises
         ------
@@ -219,7 +223,7 @@ class TwinBus:
             return answer
 
     async def _carried(self, frame: bytes) -> bytes:
-        """Carry a frame when its last byte has been sent; return the replies."""
+        """Carry a frame once its last byte has been sent, and return the stations' replies."""
         if not PROGRAM.get():
             if self._per_byte:
                 await asyncio.sleep(self._per_byte * len(frame))
@@ -250,7 +254,7 @@ class TwinBus:
     # -- the wire --------------------------------------------------------------------------
 
     def carry(self, frame: bytes) -> bytes:
-        """Deliver a frame from the master to all stations now; return their replies."""
+        """Deliver a frame from the master to all stations now and return their replies."""
         if self._tap is not None:
             self._tap.sent(frame, self._clock.monotonic())
         return self._back(self.inject(frame, late=True))
@@ -261,11 +265,11 @@ class TwinBus:
         Parameters
         ----------
         frame
-            Bytes.
+            Bytes to deliver.
         how
-            Reported to the tap for bytes that no bus fault affects.
+            How the tap is told that bytes arrive, if no bus fault affects them.
         late
-            Whether delayed bytes arrive now, after these.
+            Whether delayed bytes arrive now, after ``frame``.
         """
         if self.faults.stuck:
             return b""

@@ -22,7 +22,7 @@ class SimulatedTime:
         Clock whose ``monotonic`` measures the elapsed time, and whose ``utc`` at the start is the
         truth.
     error
-        Error bound that it reports while there is no fault, in s.
+        Error bound reported while there is no fault, in s.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class SimulatedTime:
     detects
         Whether a jump is reported; a time keeper that hides jumps is the worse fault.
     quality
-        Quality that it reports; "none" has no error bound.
+        Reported quality; "none" means that there is no error bound.
     """
 
     def __init__(self, clock: Clock, error: float = 0.05) -> None:
@@ -48,7 +48,7 @@ class SimulatedTime:
         self.quality: Quality = "gps"
 
     def jump(self, seconds: float) -> None:
-        """Set the reported time forward or back."""
+        """Step the reported time forward or back."""
         self.offset += seconds
         self._jumped_at = self._clock.monotonic()
 
@@ -75,7 +75,7 @@ class SimulatedTime:
 
 
 class DriftingClock:
-    """A computer's clocks: an inaccurate oscillator, and a calendar clock that may be set.
+    """A computer's clocks: an inaccurate oscillator, and a calendar clock that can be set.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class DriftingClock:
     start
         UTC when the clock is created.
     drift
-        Relative rate error: 50e-6 is a poor quartz.
+        Relative rate error; 50e-6 corresponds to a poor quartz oscillator.
     """
 
     def __init__(self, source: Callable[[], float], start: datetime, drift: float = 0.0) -> None:
@@ -95,7 +95,7 @@ class DriftingClock:
         self._inner = VirtualClock(source, start, rate=1.0 + drift)
 
     def monotonic(self) -> float:
-        """Return the oscillator's seconds, which never go back or jump."""
+        """Return the seconds of the oscillator, which never runs backwards or jumps."""
         return self._inner.monotonic()
 
     def utc(self) -> datetime:
@@ -103,7 +103,7 @@ class DriftingClock:
         return self._inner.utc()
 
     def jump(self, seconds: float) -> None:
-        """Set the calendar clock forward or back."""
+        """Step the calendar clock forward or back."""
         self._inner.jump(seconds)
 
 
@@ -113,9 +113,9 @@ class TickCounter:
     Parameters
     ----------
     start
-        Count at true time 0; near ``ticks.PERIOD`` it soon wraps.
+        Count at true time 0; a count near ``ticks.PERIOD`` soon wraps.
     drift
-        Ratio.
+        Relative rate error.
     """
 
     def __init__(self, start: int = 0, drift: float = 0.0) -> None:
@@ -128,5 +128,5 @@ class TickCounter:
         return ticks.add(self._start, int(1000.0 * self._rate * seconds) + self._jumped)
 
     def jump(self, milliseconds: int) -> None:
-        """Set the counter forward or back, as a glitch of its oscillator would."""
+        """Step the counter forward or back, as a glitch of its oscillator would."""
         self._jumped += milliseconds

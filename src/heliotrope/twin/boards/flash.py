@@ -1,4 +1,4 @@
-"""NOR flash of a board, with a supply that may fail at any byte."""
+"""NOR flash of a board whose supply may fail at any byte."""
 
 import random
 
@@ -6,7 +6,7 @@ from heliotrope.errors import HeliotropeError
 
 
 class PowerCutError(HeliotropeError):
-    """The supply failed during a write or an erasure; the board stops at once."""
+    """The supply failed during a write or an erase operation; the board stops at once."""
 
 
 class NorFlash:
@@ -22,19 +22,20 @@ class NorFlash:
     Attributes
     ----------
     budget
-        Number of bytes written and erased after which the supply fails; None: never.
+        Number of bytes written or erased after which the supply fails; None if it never fails.
     ragged
         Whether a power failure leaves all bytes of the operation with a mixture of new and old
         bits, as if a page stored them in any order; otherwise only the byte at the failure.
     erasures
-        Count for each block.
+        Number of erase operations per block.
 
     Raises
     ------
     PowerCutError
         Raised by ``write`` and ``erase``, at the power failure.
     ValueError
-        Raised by ``write`` if a byte was written since its erasure, which the journal never does.
+        Raised by ``write`` if a byte has already been written since it was erased; the journal
+        never does this.
     """
 
     def __init__(self, seed: int = 0, block_size: int = 4096, blocks: int = 6) -> None:
@@ -47,11 +48,11 @@ class NorFlash:
         self._chance = random.Random(seed)
 
     def read(self, offset: int, size: int) -> bytes:
-        """Return bytes."""
+        """Return bytes from an address."""
         return bytes(self._cells[offset : offset + size])
 
     def write(self, offset: int, data: bytes) -> None:
-        """Clear the bits that are clear in ``data``."""
+        """Write ``data``: clear the bits that are 0 in it."""
         if self._cells[offset : offset + len(data)] != b"\xff" * len(data):
             raise ValueError(
                 f"flash: {len(data)} bytes at {offset} are already written; erase them"

@@ -27,7 +27,7 @@ class MotorAxis:
     Attributes
     ----------
     emitted
-        Sum of all signed steps ordered, relative to the count at the start.
+        Sum of all signed steps ordered, relative to the initial count.
     turned
         Position of the motor, steps.
     joint
@@ -63,7 +63,7 @@ class MotorAxis:
         self.fastest = min(self.fastest, interval_us)
 
     def play_to(self, now: float) -> None:
-        """Make the pulses that are due by a time in s."""
+        """Emit the pulses that are due by a time in s."""
         while self._queue:
             direction, count, interval_us = self._queue[0]
             # The interval follows each pulse: the first pulse comes at once.
@@ -91,12 +91,12 @@ class MotorAxis:
         self.joint = min(max(self.joint, float(self.turned)), self.turned + self.play)
 
     def release(self, full: int) -> None:
-        """Switch the current off; the rotor moves to the nearest full step."""
+        """Switch the motor current off; the rotor settles at the nearest full step."""
         away = (self.turned + full // 2) % full - full // 2
         self._turn(-1 if away > 0 else 1, abs(away))
 
     def stop(self) -> int:
-        """Stop at once; return the signed steps that were ordered but not made."""
+        """Stop at once and return the signed steps that were ordered but not made."""
         undone = sum(direction * count for direction, count, _ in self._queue)
         if self._queue:
             undone -= self._queue[0][0] * self._done
@@ -107,5 +107,5 @@ class MotorAxis:
 
     @property
     def idle(self) -> bool:
-        """Whether there are no more pulses to make."""
+        """Whether all pulses have been made."""
         return not self._queue

@@ -1,4 +1,4 @@
-"""Heliostats to simulate: imperfect mechanisms, and the items that their boards store."""
+"""Simulated heliostats: imperfect mechanisms, and the items that their boards store."""
 
 import hashlib
 import math
@@ -45,16 +45,16 @@ MOST = 32
 
 @dataclass(frozen=True)
 class Outfit:
-    """One heliostat: name, addresses and key, true mechanism, journal.
+    """One heliostat: its name, addresses, key, true mechanism and journal.
 
     Attributes
     ----------
     causes
-        Imperfections by parameter, rad.
+        Imperfections, by parameter name, rad.
     items
-        Items of its journal, by name: see `lcu.journal.ITEMS`.
+        Items of the heliostat's journal, by name; see `lcu.journal.ITEMS`.
     machine
-        Its motor limits and rest positions.
+        Motor limits and rest positions.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Outfit:
     machine: Machine = MACHINE
 
     def with_causes(self, causes: Mapping[str, float]) -> Mechanism:
-        """Return its mechanism with its imperfections replaced by others (rad, by parameter)."""
+        """Return the true mechanism with other imperfections (rad, by parameter name)."""
         return _perfect(self.mechanism.position).with_parameters(causes)
 
     @property
@@ -78,7 +78,7 @@ class Outfit:
 
 
 def sha256(data: bytes) -> bytes:
-    """Return the hash that the boards use."""
+    """Return the SHA-256 hash of some bytes, as the boards compute it."""
     return hashlib.sha256(data).digest()
 
 
@@ -92,7 +92,7 @@ def outfits(count: int, seed: int = 0, places: Sequence[tuple[float, float]] = (
     seed
         Seed of positions and imperfections.
     places
-        East and north of each heliostat, m; (): drawn.
+        East and north of each heliostat, m; () if they are drawn at random.
 
     Raises
     ------
@@ -139,14 +139,14 @@ def _perfect(places: npt.ArrayLike) -> Mechanism:
 def stow_beams(
     places: Sequence[tuple[float, float]], suns: npt.NDArray[np.float64]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return vertices (N, 1, 3) and directions (N, S, 3) of the beams at stow.
+    """Return the vertices, (N, 1, 3), and directions, (N, S, 3), of the beams at stow.
 
     Parameters
     ----------
     places
         East and north of N heliostats without imperfections, m.
     suns
-        Unit vectors, (S, 3).
+        Unit vectors to the sun, (S, 3).
     """
     pose = _perfect([(*place, 0.0) for place in places]).pose(np.tile(STOW, (len(places), 1)))
     normal = pose.normal[:, None]

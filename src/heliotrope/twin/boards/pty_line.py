@@ -1,4 +1,4 @@
-"""The bus line as a pseudo-terminal: boards at one end, a serial port at the other."""
+"""The bus line as a pseudo-terminal, with boards at one end and a serial port at the other."""
 
 import asyncio
 import os
@@ -18,7 +18,7 @@ class PtyLine:
     Parameters
     ----------
     clock
-        Its monotonic time is that of the stations.
+        Clock whose monotonic time is the stations' time.
     stations
         Devices that receive every frame.
 

@@ -1,4 +1,4 @@
-"""A whole field of local controllers as arrays: `Field`, with a `FieldBus` for each cluster."""
+"""A whole field of local controllers as arrays: a `Field`, and a `FieldBus` for each cluster."""
 
 from heliotrope.twin.field.field import Field
 from heliotrope.twin.field.field_bus import FieldBus

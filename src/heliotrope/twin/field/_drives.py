@@ -1,7 +1,7 @@
 """Motors and gears of a whole field: from emitted steps to joint positions.
 
-Same as `twin.boards.motors` for one axis, except within a tick: steps are made when they are
-emitted, which on a board happens up to a tenth of a second before its timer executes them.
+The model equals `twin.boards.motors` for one axis, except within a tick: steps take effect when
+they are emitted, which on a board happens up to a tenth of a second before its timer executes them.
 """
 
 import numpy as np
@@ -58,7 +58,10 @@ class Drives:
         self._chance = np.random.default_rng(seed)
 
     def next(self) -> tuple[Integers, FloatArray, FloatArray, Bools, Integers]:
-        """Return the arrays that the kernel advances in the next tick; draws the steps to lose."""
+        """Return the arrays that the kernel advances in the next tick.
+
+        This also draws which axes lose a step.
+        """
         if self._miss > 0.0:
             self._lost = self._chance.random(self.turned.shape) < self._miss
         return self.turned, self.joint, self._play, self._lost, self.missed

@@ -1,4 +1,4 @@
-"""The stepper of `lcu.stepper` for many heliostats at once: the same integers, slot by slot."""
+"""The stepper of `lcu.stepper` for many heliostats at once, with the same integer arithmetic."""
 
 from numba import njit
 
@@ -94,7 +94,10 @@ def _slot(axes, i, k, held):
 
 @njit(**OPTIONS)
 def go_rows(axes, order, rows, goals, how):
-    """Go to step counts (M, 2): `Stepper.go`, and `Stepper.follow` where ``how`` (M) is -1."""
+    """Set step counts (M, 2) as goals, as `Stepper.go` does.
+
+    Where ``how`` (M,) is -1, follow them as `Stepper.follow` does.
+    """
     for j in range(len(rows)):
         i = rows[j]
         order[i] = BOTH if how[j] < 0 else how[j]
@@ -114,7 +117,7 @@ def go_rows(axes, order, rows, goals, how):
 
 @njit(**OPTIONS)
 def brake_rows(axes, rows):
-    """Slow down, stop and drop the goals: `Axis.brake`."""
+    """Slow down to a stop and drop the goals, as `Axis.brake` does."""
     for i in rows:
         for k in range(2):
             axes[i, k]["braking"] = True
@@ -124,14 +127,14 @@ def brake_rows(axes, rows):
 
 @njit(**OPTIONS)
 def still_rows(axes, queued, out):
-    """Return whether each heliostat is at rest: `Stepper.still`."""
+    """Determine whether each heliostat is at rest, as `Stepper.still` does."""
     for i in range(len(axes)):
         out[i] = queued[i] <= 0 and _still(axes, i, 0) and _still(axes, i, 1)
 
 
 @njit(**INNER)
 def _carry(drives, i, k, steps):
-    """Turn a motor by its emitted steps; the pushing gear flank carries the joint."""
+    """Turn a motor by its emitted steps, and carry the joint along with the pushing gear flank."""
     turned, joint, play, lost, missed = drives
     if steps == 0:
         return
@@ -145,10 +148,10 @@ def _carry(drives, i, k, steps):
 
 @njit(**OPTIONS)
 def advance_rows(axes, order, queued, drives, elapsed_ms, slot_ms, ahead_ms):
-    """Emit the steps that fit into the time: `Stepper.advance`.
+    """Emit the steps that fit into the elapsed time, as `Stepper.advance` does.
 
-    ``drives`` holds, each (N, 2): positions of motors and joints, the play, whether a step is lost
-    next, and the number lost so far.
+    ``drives`` contains arrays of shape (N, 2): positions of motors, positions of joints, backlash,
+    whether the next step is lost, and the number of steps lost so far.
     """
     for i in range(len(axes)):
         queued[i] -= elapsed_ms

@@ -5,10 +5,10 @@ defocused and back, in the same integer arithmetic: poses come from the vectoris
 `mechanism`, steps from the kernels in this package. Step counts equal those of a board with the
 real firmware wherever both exist.
 
-It models STOWED, APPROACHING, IDLE at standby, TRACKING, DEFOCUSED, STOWING, LOCKED and FAULT, the
-lease, and the autonomous path to defocus and stow. Power may fail and return; gears have backlash,
-motors lose steps, and the wind deflects mirrors. Settings, searching and jogging need a board
-(`twin.boards.board`).
+The field models STOWED, APPROACHING, IDLE at standby, TRACKING, DEFOCUSED, STOWING, LOCKED and
+FAULT, the lease, and the autonomous path to defocus and stow. Power may fail and return; gears have
+backlash, motors lose steps, and the wind deflects mirrors. Settings, searching and jogging need a
+board (`twin.boards.board`).
 """
 
 from collections.abc import Sequence
@@ -92,18 +92,18 @@ class Field:
     machine
         Limits and rest positions, with a standby point: one for all, or one per heliostat.
     believed
-        Mechanisms that the controllers store; None: the true mechanisms.
+        Mechanisms that the controllers store; None if they store the true mechanisms.
     play, miss, seed
         See `Drives`.
     wind
-        Wind that deflects the mirrors; None: no wind.
+        Wind that deflects the mirrors; None for no wind.
 
     Attributes
     ----------
     state, kind
-        See `lcu.states` (-1 without power) and `lcu.motion`, (N,).
+        State, see `lcu.states` (-1 without power), and kind of motion, see `lcu.motion`, (N,).
     fault
-        See `lcu.controller`, 0 for none, (N,).
+        Fault number, see `lcu.controller`; 0 if there is no fault, (N,).
     axes
         Counts of the controllers, dtype `AXIS`, (N, 2).
     drives
@@ -115,12 +115,12 @@ class Field:
     journals
         Journals of the controllers.
     aim
-        (N, 3), m.
+        Aim points, (N, 3), m.
 
     Raises
     ------
     InputError
-        If it is not an array of mechanisms with two drives each.
+        If ``mechanism`` is not an array of mechanisms with two drives each.
     """
 
     def __init__(
@@ -196,7 +196,10 @@ class Field:
         return np.asarray(self.journals.drives(chosen).angles(np.asarray(counts, dtype=np.float64)))
 
     def _pose(self, rows: Rows, aims: FloatArray, ahead_ms: int) -> tuple[FloatArray, Bools]:
-        """Return joint angles (M, 2) for aims (M, 3), and which of the aims can be reached."""
+        """Return the joint angles for aims, (M, 2), and whether each aim can be reached, (M,).
+
+        ``aims`` has shape (M, 3).
+        """
         sun = (self._sun[0] + self._sun[1] * (self._sun_ms + ahead_ms) // 1000) / UNIT
         counts = self.axes["count"][rows].astype(np.float64)
         return self.journals.pose(rows, sun / np.linalg.norm(sun), aims, counts)
@@ -206,11 +209,11 @@ class Field:
         kernels.go_rows(self.axes, self._order, rows, steps, how)
 
     def _away(self, rows: Rows, angles: FloatArray) -> FloatArray:
-        """Angles turned away by the defocus."""
+        """Return joint angles turned away by the heliostats' defocus offsets."""
         return turned(angles, self._offset[rows], self._low[rows], self._high[rows])
 
     def still(self, rows: Rows | None = None) -> Bools:
-        """Whether each heliostat is at rest, (N,), or (M,) for some indices."""
+        """Return whether heliostats are at rest: all (N,), or those in ``rows`` (M,)."""
         axes, queued = self.axes, self._queued
         if rows is not None:
             axes, queued = axes[rows], queued[rows]
@@ -219,12 +222,12 @@ class Field:
         return out
 
     def ready(self, rows: Rows) -> Bools:
-        """Whether heliostats have reached standby by the safe path, (M,)."""
+        """Return whether heliostats have reached standby along the safe path, (M,)."""
         arrived: Bools = self._ready[rows]
         return arrived
 
     def at_stow(self, rows: Rows | None = None) -> Bools:
-        """Whether each heliostat is at stow and at rest, (N,), or (M,) for some indices."""
+        """Return whether heliostats are at rest at stow: all (N,), or those in ``rows`` (M,)."""
         count, stow = self.axes["count"], self._stow
         if rows is not None:
             count, stow = count[rows], stow[rows]
@@ -269,29 +272,32 @@ class Field:
         self._aside[rows], self._turn_goals[rows] = TURNING, self.axes["goal"][rows]
 
     def _go_on_turning(self, rows: Rows) -> None:
-        """Continue turns that a reset or an emergency stop has interrupted."""
+        """Resume turns away from the aim that a reset or an emergency stop has interrupted."""
         self.kind[rows], self._base[rows] = DEFOCUS, HOLD
         rows = rows[self._aside[rows] == TURNING]
         both = np.full(len(rows), kernels.BOTH)
         kernels.go_rows(self.axes, self._order, rows, self._turn_goals[rows], both)
 
     def _leaving(self, rows: Rows) -> Bools:
-        """Return the mask of heliostats whose motion takes the beam off: `Motion.leaving`."""
+        """Return a mask of heliostats whose motion takes the beam off, as in `Motion.leaving`."""
         turns = (self.kind[rows] == DEFOCUS) & (self._aside[rows] == TURNING)
         return np.asarray(among(self.kind[rows], STOW, RETURN) | turns)
 
     def _note_motions(self) -> None:
-        """Drop the turns that other motions have replaced: `Controller._mark`."""
+        """Forget turns away that a later motion has replaced, as `Controller._mark` does."""
         self._aside[~among(self.kind, HOLD, DEFOCUS)] = NO_TURN
 
     def _lock_now(self, rows: Rows) -> None:
-        """Stand still, but first finish any motion that takes the beam off: `Motion.lock`."""
+        """Stand still, but first finish any motion that takes the beam off, as in `Motion.lock`."""
         leaving = self._leaving(rows)
         self._base[rows[leaving]] = HOLD
         self._hold(rows[~leaving])
 
     def _down(self, rows: Rows) -> tuple[FloatArray, FloatArray]:
-        """Return points (M, 3) and angles (M, 2) down the safe path, or NaN: `Motion._turn`."""
+        """Return the points (M, 3) and joint angles (M, 2) at which turns down the safe path end.
+
+        They are NaN where a heliostat cannot turn down the path; see `Motion._turn`.
+        """
         at_standby = (self._target[rows] == self.journals.standby[rows]).all(axis=1)
         held = self._ready[rows] & (self.kind[rows] == HOLD) & at_standby
         stands = held | (self.kind[rows] == STANDBY)
@@ -308,7 +314,7 @@ class Field:
         )
 
     def _choose_offsets(self, rows: Rows) -> None:
-        """Choose the angles by which heliostats turn away: `Motion._turn`."""
+        """Choose the angles by which heliostats turn away, as `Motion._turn` does."""
         tracks = self.kind[rows] == TRACK
         points = np.where(tracks[:, None], self.journals.standby[rows], self.aim[rows])
         points[~self._recent(rows)] = np.nan
@@ -337,7 +343,7 @@ class Field:
         )
 
     def _return(self, rows: Rows) -> None:
-        """Return along the approach path, and stow."""
+        """Return along the approach path to stow."""
         for i in rows:
             self._set_path(i, self._way_back(i))
         self.kind[rows] = RETURN
@@ -378,14 +384,14 @@ class Field:
     def take_sun(
         self, values: tuple[int, ...], rows: Rows | None = None, delay_ms: int = 0
     ) -> None:
-        """Receive a SUN message, sent every second, which renews the lease.
+        """Receive a SUN message, which is sent every second and renews the lease.
 
         Parameters
         ----------
         values
-            As in the message: second, direction, rate.
+            Contents of the message: second, direction, rate.
         rows
-            Heliostats that receive it; None: all.
+            Heliostats that receive the message; None for all heliostats.
         delay_ms
             Time in transit.
         """
@@ -398,7 +404,7 @@ class Field:
         self.hear(heard)
 
     def put_up(self, values: tuple[int, ...], aims: npt.ArrayLike) -> Bools:
-        """Set stowed heliostats to tracking, as if raised before; return a mask of them, (N,).
+        """Set stowed heliostats to tracking at once; return a mask of these heliostats, (N,).
 
         Heliostats that cannot bring their beams to their aims stay at stow.
 
@@ -424,20 +430,23 @@ class Field:
         return np.isin(np.arange(len(self)), rows)
 
     def hear(self, rows: Rows) -> None:
-        """Note that heliostats hear from their cluster, without which they hold no position."""
+        """Record that heliostats hear from their cluster.
+
+        A heliostat that does not hear from its cluster leaves any position that it holds.
+        """
         self._heard[rows] = LEASE_MS
         held = (self.kind[rows] == HOLD) & (self.state[rows] != states.FAULT)
         self._aside[rows[held & (self.state[rows] >= 0)]] = NO_TURN
 
     def order(self, name: str, rows: Rows | None = None, aim: npt.ArrayLike | None = None) -> Bools:
-        """Give a command; return which heliostats accept it, (N,).
+        """Send a command to heliostats; return which of them accept it, (N,).
 
         Parameters
         ----------
         name
             DEFOCUS, STOW, APPROACH, IDLE, TRACK, REFOCUS, AIM, LOCK, UNLOCK or CLEAR_FAULT.
         rows
-            Heliostats; None: all.
+            Heliostats; None for all heliostats.
         aim
             Aim point of AIM, (3,) or (M, 3), m.
 
@@ -480,7 +489,7 @@ class Field:
         return taken
 
     def _stow_now(self, rows: Rows) -> None:
-        """STOW, by the state table."""
+        """Carry out STOW, according to the state table."""
         state = self.state[rows]
         kept = among(state, states.LOCKED, states.FAULT)
         self._stow_directly(rows[kept])
@@ -491,7 +500,7 @@ class Field:
         self._stow_directly(goes[~fresh])
 
     def _lock(self, rows: Rows, name: str) -> Rows:
-        """LOCK, UNLOCK and CLEAR_FAULT; return which heliostats accept it."""
+        """Carry out LOCK, UNLOCK or CLEAR_FAULT; return which heliostats accept it."""
         state = self.state[rows]
         if name == "LOCK":
             self._enter(rows, states.LOCKED)
@@ -511,7 +520,7 @@ class Field:
         return rows
 
     def _sun_bound(self, rows: Rows, name: str) -> Rows:
-        """TRACK, REFOCUS and IDLE; return which heliostats accept it."""
+        """Carry out TRACK, REFOCUS or IDLE; return which heliostats accept it."""
         state, fresh = self.state[rows], self._lease[rows] > 0
         if name == "IDLE":
             back = (state == states.DEFOCUSED) & self._ready[rows] & fresh
@@ -534,7 +543,7 @@ class Field:
         self._hold(rows[~able])
 
     def _defocus_now(self, rows: Rows) -> None:
-        """DEFOCUS, LAPSED or UNREACHABLE, by the state table."""
+        """Carry out DEFOCUS, LAPSED or UNREACHABLE, according to the state table."""
         state = self.state[rows]
         goes = rows[among(state, states.APPROACHING, states.IDLE, states.TRACKING)]
         if len(goes):
@@ -548,7 +557,7 @@ class Field:
         return int(self._lease[row])
 
     def leases(self, rows: Rows) -> npt.NDArray[np.int64]:
-        """Return the remaining leases of some heliostats, ms, (M,)."""
+        """Return the remaining leases of the heliostats in ``rows``, ms, (M,)."""
         return self._lease[rows]
 
     # -- faults and power ------------------------------------------------------------------
@@ -583,9 +592,9 @@ class Field:
         self._present[rows] = False
 
     def cut(self, rows: Rows, *, warned: bool = False) -> None:
-        """Cut the power: motors stop, nothing is received. Steps already emitted are still made.
+        """Cut the power: motors stop and messages are lost, but emitted steps are still made.
 
-        ``warned``: the brown-out detectors notice in time, which leaves a fault.
+        If ``warned``, the brown-out detectors notice the failure in time and leave a fault.
         """
         rows = rows[self.state[rows] >= 0]
         self.edition += 1
@@ -604,9 +613,9 @@ class Field:
             self.axes[name][rows] = self.axes["count"][rows]
 
     def restore(self, rows: Rows) -> None:
-        """Restore the power: locked and faulty controllers remain so, all others turn away.
+        """Restore the power; heliostats turn away unless they were locked or in FAULT.
 
-        A turn that had begun is continued, and so is the direct path to stow.
+        A turn that had begun is resumed, and so is a motion directly to stow.
         """
         rows = rows[self.state[rows] < 0]
         self.edition += 1
@@ -662,7 +671,10 @@ class Field:
         )
 
     def _lapses(self, fresh: Bools, silent: Bools, needs: Bools) -> None:
-        """`Controller._lapses`; ``needs``: in a state that needs the sun."""
+        """Apply lapsed leases, as `Controller._lapses` does.
+
+        ``needs`` marks heliostats in a state that needs the sun vector.
+        """
         dark, latched = self._dark == 0, among(self.state, states.LOCKED, states.FAULT)
         idle = self.state == states.IDLE
         comes = self.kind == RETURN
@@ -681,7 +693,7 @@ class Field:
             self._stow_directly(dark_rows[~self._leaving(dark_rows) & ~self.at_stow(dark_rows)])
 
     def _move(self) -> None:
-        """`Motion.tick`."""
+        """Advance all motions by a tick, as `Motion.tick` does."""
         for timer in (self._knot, self._renew):
             np.maximum(timer - TICK_MS, 0, out=timer)
         np.minimum(self._since + TICK_MS, KNOT_MS, out=self._since)
@@ -706,7 +718,7 @@ class Field:
                 self._defocus_now(lost)
 
     def _on_path(self, rows: Rows) -> None:
-        """Continue along the path: `Motion._on_path`."""
+        """Continue along the path, as `Motion._on_path` does."""
         self._place[rows] += 1
         goes = rows[self._place[rows] < self._length[rows]]
         ends = rows[self._place[rows] >= self._length[rows]]
@@ -725,7 +737,10 @@ class Field:
         self._stow_directly(ends[self.kind[ends] == RETURN])
 
     def _follow(self, rows: Rows) -> Rows:
-        """Keep beams on their aims: `Motion._follow`; return those whose aims no pose reaches."""
+        """Keep beams on their aims, as `Motion._follow` does.
+
+        Return the heliostats whose aims no pose reaches.
+        """
         new = rows[self._knot[rows] <= 0]
         lost = new[:0]
         if len(new):
@@ -753,7 +768,7 @@ class Field:
         return self.stand()[0]
 
     def stand(self) -> tuple[FloatArray, FloatArray]:
-        """Return true normals and vertices, (N, 3)."""
+        """Return the true normals and vertices, each (N, 3)."""
         pose = self.mechanism.pose(self.drives.joint)
         if self.wind is None:
             return pose.normal, pose.vertex
@@ -766,7 +781,10 @@ class Field:
         self.edition += 1
 
     def errors(self, sun: FloatArray, aims: FloatArray) -> FloatArray:
-        """Return the error of each normal if it tracked aims (N, 3) now, rad, (N,)."""
+        """Return the error that each normal would have if it tracked ``aims``, rad, (N,).
+
+        ``aims`` has shape (N, 3), m.
+        """
         rows = np.arange(len(self))
         counts = self.axes["count"].astype(np.float64)
         angles, good = self.journals.pose(rows, sun, aims, counts)
@@ -781,7 +799,10 @@ class Field:
 
 
 def _limit(axes: npt.NDArray[np.void], rows: Rows, index: int, axis: AxisLimits) -> None:
-    """Set the limits of an axis for rows of dtype `AXIS`, as `lcu.stepper.Axis` does."""
+    """Set the limits of an axis for some heliostats, as `lcu.stepper.Axis` does.
+
+    ``axes`` has dtype `AXIS`.
+    """
     # Intervals are whole microseconds.
     room = 1000 * SLOT_MS * kernels.SCALE // -(-1_000_000 // axis.rate)
     values = {

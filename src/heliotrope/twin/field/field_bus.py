@@ -1,9 +1,9 @@
-"""A bus whose stations are rows of a vectorised field; each frame takes microseconds.
+"""A bus whose stations are heliostats of a vectorised field; a frame takes microseconds.
 
 One `FieldBus` is the bus of one cluster. It replies to QUERY_STATUS and QUERY_STEPS, receives SUN,
-and passes commands on to the `Field`. It has no noise, and has gates only if it is given the keys
-of its local controllers (`Gates`); boards (`twin.boards`) on a `TwinBus` have both, and all other
-messages.
+and passes commands on to the `Field`. It has no noise, and checks frames only if it is given the
+keys of its local controllers (`Gates`). Boards (`twin.boards`) on a `TwinBus` have noise and gates,
+and support all other messages.
 """
 
 import asyncio
@@ -84,10 +84,10 @@ class FieldBus:
     rows
         Indices of this cluster's heliostats in the field; their addresses are 1, 2, and so on.
     took
-        Function called with the name and the indices of each command; None: no call.
+        Function called with each command's name and heliostat indices; None for no call.
     keys
-        Key of each local controller, in the same order, which gives each a gate and lets it accept
-        a bus key. Without keys every valid frame is obeyed, signed or not.
+        Key of each local controller, in the same order; with a key, a local controller has a gate
+        and accepts a bus key. Without keys every valid frame is obeyed, signed or not.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class FieldBus:
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
     ) -> SendOutcome:
-        """Send a frame without a reply, and let other buses of the process take their turn."""
+        """Send a frame that expects no reply, and let the process's other buses take their turn."""
         del expires, urgent
         await asyncio.sleep(0)
         if self.closed:
@@ -163,7 +163,7 @@ class FieldBus:
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return the reply, or b""."""
+        """Send a frame and return the reply; b"" if there is none."""
         del timeout, expires, complete
         if urgent:
             # In an emergency all buses and the plant take turns.
@@ -266,7 +266,7 @@ class FieldBus:
         return self._status_payloads
 
     def _answer(self, place: int, sequence: int, name: str, payload: bytes) -> bytes:
-        """Return a heliostat's reply frame; b"" without power."""
+        """Return a heliostat's reply frame; b"" if the heliostat has no power."""
         if self._field.state[self._rows[place]] < 0:
             return b""
         head = _HEADER.pack(wire.VERSION, wire.CLUSTER_ADDRESS, place + 1, sequence, _NUMBERS[name])
@@ -313,7 +313,7 @@ class FieldBus:
 
 
 def _unstuffed(data: bytes) -> bytes:
-    """Undo `_stuffed` and its final zero; b"" if that is impossible."""
+    """Return the payload of stuffed bytes, the inverse of `_stuffed`; b"" if they are invalid."""
     if data.find(0) != len(data) - 1:
         return b""
     out, place, end = bytearray(data), 0, len(data) - 1
@@ -325,7 +325,7 @@ def _unstuffed(data: bytes) -> bytes:
 
 
 def _stuffed(data: bytes) -> bytes:
-    """Same as `wire.stuff`, block by block instead of byte by byte.
+    """Return the result of `wire.stuff`, computed block by block instead of byte by byte.
 
     No frame is long enough (`wire.FRAME_LIMIT`) for a block of 254 bytes, so parts between zeros
     may be stuffed separately and joined.
@@ -335,7 +335,7 @@ def _stuffed(data: bytes) -> bytes:
 
 @lru_cache(maxsize=4096)
 def _parts(payload: bytes) -> tuple[bytes, bytes, bytes]:
-    """Return a payload up to its first zero, its stuffed middle, and the part after its last zero.
+    """Split a payload at its first and last zero; return the three parts, the middle one stuffed.
 
     A field's heliostats stay in the same state for hours, so few payloads differ. Each has at least
     two zeros, since a STATUS of a field reports no uptime.

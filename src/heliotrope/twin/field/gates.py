@@ -26,21 +26,21 @@ Flags = npt.NDArray[np.uint32]
 
 
 class Gates:
-    """The gates of the rows of one bus.
+    """The gates of one bus, one gate per heliostat.
 
     Parameters
     ----------
     field
         The whole field; bus keys are kept in its journals.
     rows
-        Rows of this bus.
+        Indices of the bus's heliostats in the field.
     keys
         Key of each local controller, in the same order.
 
     Attributes
     ----------
     boots
-        Number of boots of each row, (N,).
+        Number of boots of each heliostat, (N,).
     """
 
     def __init__(self, field: Field, rows: range, keys: Sequence[bytes]) -> None:
@@ -52,7 +52,7 @@ class Gates:
         self._second: int | None = None
 
     def _started(self, place: int) -> wire.Gate:
-        """Return the gate of a heliostat that boots now."""
+        """Return the gate of a heliostat that is booting."""
         items, own = self._field.journals.items(self._rows[place]), self._keys[place]
         edition = struct.unpack("<I", items["edition"])[0] if "edition" in items else 0
         self.boots[place] += 1
@@ -77,13 +77,13 @@ class Gates:
         return len(back) > 0
 
     def flags(self) -> Flags:
-        """Return the flags of STATUS about keys and sessions, (N,)."""
+        """Return the STATUS flags that concern keys and sessions, (N,)."""
         return np.array(
             [_KEYED * gate.keyed() + _WANTS * gate.waits() for gate in self._gates], dtype=np.uint32
         )
 
     def judge(self, frame: wire.Frame, place: int) -> int:
-        """Return DONE if a frame may act on a heliostat, otherwise the reason why not."""
+        """Return DONE if a frame may act on a heliostat, otherwise the reason for its refusal."""
         if self._off[place]:
             return messages.REFUSED_STATE
         result = self._gates[place].judge(frame, self._field.now_ms, self._second)
@@ -93,7 +93,7 @@ class Gates:
         return result
 
     def reported(self, place: int) -> tuple[int, ...]:
-        """Return the values of BUS."""
+        """Return the values of a heliostat's BUS message."""
         return self._keys_of(place).told()
 
     def take_key(self, frame: wire.Frame, place: int) -> int:

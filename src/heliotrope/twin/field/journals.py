@@ -24,12 +24,12 @@ Bools = npt.NDArray[np.bool_]
 
 
 class Journals:
-    """Journals of N local controllers, with the beliefs that follow from them as arrays.
+    """Journals of N local controllers, with the mechanisms and positions they imply as arrays.
 
     Parameters
     ----------
     believed
-        Mechanisms stored at first, (N,).
+        Mechanisms stored initially, (N,).
     machine
         Limits and rest positions: one for all heliostats, or one per heliostat.
 
@@ -69,7 +69,7 @@ class Journals:
                 self.standby[rows] = table.standby
 
     def machines(self) -> list[tuple[Machine, Rows]]:
-        """Return each machine table with the rows of its heliostats."""
+        """Return each distinct machine table with the indices of its heliostats."""
         rows: dict[Machine, list[int]] = {}
         for row, table in enumerate(self._machines):
             rows.setdefault(table, []).append(row)
@@ -91,13 +91,13 @@ class Journals:
         return np.broadcast_to(self._nominal.position, (len(self.armatures), 3))
 
     def drives(self, rows: Rows) -> Drive:
-        """Return the believed drives of some rows, (M, 2)."""
+        """Return the drives of some heliostats as their controllers believe them, (M, 2)."""
         return Drive(self._drives[rows])
 
     def pose(
         self, rows: Rows, sun: FloatArray, aims: FloatArray, counts: FloatArray
     ) -> tuple[FloatArray, Bools]:
-        """Return the joint angles that bring beams to aims, and whether the aims are reached.
+        """Return the joint angles that bring beams to aims, and whether each aim can be reached.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class Journals:
         sun
             Unit vector to the sun, (3,).
         aims
-            ENU, m, (M, 3).
+            Aim points, ENU, m, (M, 3).
         counts
             Present step counts, (M, 2): the pose that needs the least motion is chosen.
         """
@@ -128,7 +128,7 @@ class Journals:
         return self._items[row]
 
     def store(self, row: int, items: dict[str, bytes]) -> None:
-        """Store items in a controller's journal, and use them."""
+        """Store items in a controller's journal and apply them."""
         self.items(row).update(items)
         if "armature" in items:
             self.armatures[row] = struct.unpack(CODES_OF["armature"], items["armature"])

@@ -1,4 +1,4 @@
-"""The observer's record of one heliostat."""
+"""The observer's record of a single heliostat."""
 
 from collections import deque
 from struct import unpack
@@ -28,7 +28,7 @@ NEAR_STOW = 5000
 
 
 def fingerprint(board: Board, *, gate: bool, clock: bool) -> dict[str, object]:
-    """Return everything that a refused frame must leave unchanged.
+    """Return all values of a board that a refused frame must leave unchanged.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def fingerprint(board: Board, *, gate: bool, clock: bool) -> dict[str, object]:
 
 
 def steps_from_stow(board: Board) -> int:
-    """Return the true distance of a board's axes from stow, steps of the farther axis."""
+    """Return how far a board's axes truly are from stow, in steps of the farther axis."""
     return max(abs(axis.turned - stow) for axis, stow in zip(board.axes, STOW, strict=True))
 
 
@@ -75,21 +75,21 @@ class HeliostatAccount:
     Attributes
     ----------
     state
-        State last seen; -1 without power.
+        Last state seen; -1 without power.
     sun_at
         When the cluster sent the newest sun vector that the heliostat has received, s.
     taken
         Index of the last frame received whole, except queries and safe orders.
     in_hand, how, forged, quiet, before, good
         The frame being received: the cluster's frame, how it arrived, the forged frame, the
-        invariant that forbids it any change, the fingerprint before, frames counted as good
-        before.
+        invariant under which the frame must change nothing, and the fingerprint and the number of
+        good frames before it arrived.
     statuses
         Times (s) and values of the last STATUS replies that the cluster received.
     from_stow
         Whether it has left stow and has not tracked since.
     stows
-        All stow positions that it has ever been sent, steps.
+        All stow positions ever sent to the heliostat, steps.
     by_way
         Whether it has reached its standby point since it was last at stow or without power.
     booted_at, boots, cuts
@@ -97,12 +97,13 @@ class HeliostatAccount:
     stepped_at
         When its timers last received steps, s.
     ticks_jumped, misled
-        Whether its counter has jumped since it booted; whether it has received a stranger's frame.
+        Whether its counter has jumped since it booted; whether it has received a frame from a
+        stranger.
     unsure
-        Whether another heliostat's board is or was there, or a drive has stalled, so that its
-        motors may stand elsewhere than counted.
+        Whether another heliostat's board is or was installed, or a drive has stalled, so that the
+        motors may not be where the step counts say.
     written, unlisted_at
-        Its name in its cluster's file; since when the name has been missing there, s, None: it is
+        Its name in its cluster's file; when the name went missing there, s, or None if it is
         present.
     foot
         Closest approach of its beam to the foot of the safe path in this approach, m; 0 if unknown.
@@ -146,7 +147,7 @@ class HeliostatAccount:
     # -- states ----------------------------------------------------------------------------
 
     def entered(self, state: int, now: float) -> None:
-        """Note a new state."""
+        """Record a new state."""
         if state == states.APPROACHING:
             self._leg = 1 if self.state == states.STOWED else 0
             self.from_stow, self.foot = True, float("inf")
@@ -166,17 +167,17 @@ class HeliostatAccount:
 
     @property
     def changed_at(self) -> float:
-        """Time at which it entered its state or booted, s."""
+        """Time at which the heliostat entered its state or booted, s."""
         return self._history[-1][0]
 
     def was_in(self, choice: tuple[int, ...], since: float) -> bool:
-        """Whether the heliostat was in one of the given states at any time since."""
+        """Return whether the heliostat has been in one of the given states since a time."""
         begun = [state for at, state in self._history if at <= since][-1:]
         later = [state for at, state in self._history if at > since]
         return any(state in choice for state in begun + later)
 
     def cut(self, now: float) -> None:
-        """Note that the power is off."""
+        """Record a power failure."""
         sent = self.in_hand
         self._pending = {}
         if sent is not None and sent.who == messages.KEY:
@@ -192,7 +193,7 @@ class HeliostatAccount:
         self._history.append((now, -1))
 
     def booted(self, now: float) -> None:
-        """Note a boot: its times restart, and earlier frames no longer count."""
+        """Record a boot: the times restart, and earlier frames no longer count."""
         self.state = self.board.state
         self.booted_at, self.boots = now, self.boots + 1
         self.ticks_jumped = self.misled = False
@@ -207,7 +208,7 @@ class HeliostatAccount:
     # -- the journal -----------------------------------------------------------------------
 
     def keep(self) -> bool:
-        """Note the contents of the journal; return whether they have changed.
+        """Record the contents of the journal; return whether they have changed.
 
         Comparing references is enough, because each store creates a new dictionary and leaves the
         old one unchanged.
@@ -223,7 +224,7 @@ class HeliostatAccount:
         return changed
 
     def mixture(self, held: dict[str, bytes]) -> str:
-        """Return the items of a journal from neither the old nor the new record in words, or ""."""
+        """Return in words which journal items match neither the old nor the new record, or ""."""
         old = dict(self._items)
         if held in (old, {**old, **self._pending}):
             return ""
@@ -233,23 +234,23 @@ class HeliostatAccount:
     # -- steps -----------------------------------------------------------------------------
 
     def place(self) -> tuple[int, int]:
-        """Return the step counts that were handed to the timers."""
+        """Return the step counts that result from all steps handed to the timers."""
         azimuth, elevation = (
             a.emitted - s for a, s in zip(self.board.axes, self.board.slip, strict=True)
         )
         return azimuth, elevation
 
     def stow(self) -> tuple[int, int]:
-        """Return the stow position in its journal, steps."""
+        """Return the stow position stored in the journal, steps."""
         azimuth, elevation = unpack("<ii", self._items["stow"])
         return azimuth, elevation
 
     def stands_at_stow(self) -> bool:
-        """Whether its axes truly stand at the stow position, and not only by its counts."""
+        """Return whether the axes are truly at stow, and not only according to the step counts."""
         return steps_from_stow(self.board) <= NEAR_STOW
 
     def rate(self, axis: int, count: int, now: float) -> str:
-        """Note steps handed to a timer now; return an error in their rate, if any."""
+        """Record steps handed to a timer now; return an error in their rate, or ""."""
         self.stepped_at = now
         limit = float(LIMITS[0])
         drained = limit * (now - self._filled_at[axis])
@@ -260,7 +261,7 @@ class HeliostatAccount:
         return f"axis {axis} is {level:.0f} steps ahead of {limit:.0f} steps/s"
 
     def ramp(self, axis: int, steps: int, now: float) -> str:
-        """Note the signed steps of a slot; return an error in their acceleration, if any."""
+        """Record the signed steps of a slot; return an error in their acceleration, or ""."""
         most = LIMITS[1] * SLOT * SLOT + 2.0
         begin = max(now, self._slot_ends[axis])
         before = self._slot_steps[axis]
@@ -275,7 +276,10 @@ class HeliostatAccount:
         return "" if self.ticks_jumped else error
 
     def order(self, axis: int) -> str | None:
-        """Note a segment; return an error in the axis order, "", or None if any order will do."""
+        """Record a segment; return an error in the order of the axes, or "".
+
+        Return None if the axes may move in any order now.
+        """
         board = self.board
         if self._stowing_since is not None and board.now - self._stowing_since > BRAKING:
             if axis == 1:
@@ -299,19 +303,19 @@ class HeliostatAccount:
         return ""
 
     def jumped(self) -> None:
-        """Note a counter jump, after which the board may take pending steps for completed ones."""
+        """Record a counter jump, after which the board may take pending steps for completed."""
         self._leg, self.foot = 0, 0.0
         self.ticks_jumped = True
 
     # -- deadlines -------------------------------------------------------------------------
 
     def served(self, now: float, leased: bool) -> None:
-        """Note whether plant and cluster serve the heliostat."""
+        """Record whether the plant and the cluster serve the heliostat."""
         if leased and now - self.sun_at <= SERVED:
             self._served_at = now
 
     def crosses(self, on: bool, now: float) -> float:
-        """Note whether the beam is on the receiver; return for how long it has been there, s."""
+        """Record whether the beam is on the receiver; return how long it has been there, s."""
         if not on:
             self._on_since = None
             return 0.0
@@ -320,7 +324,10 @@ class HeliostatAccount:
         return now - self._on_since
 
     def stays(self, on: bool, now: float) -> float:
-        """Note where a DEFOCUSED heliostat's beam is; return for how long it has been on, s."""
+        """Record whether a DEFOCUSED heliostat's beam is on the receiver.
+
+        Return how long it has been there, s.
+        """
         if not on:
             self._stays_since = None
             return 0.0
@@ -329,7 +336,7 @@ class HeliostatAccount:
         return now - begun
 
     def must(self, name: str, now: float) -> None:
-        """Note an order to DEFOCUS or STOW."""
+        """Record an order to DEFOCUS or STOW."""
         if self.board.node is not None:
             self._ordered.setdefault(name, now)
 
@@ -338,7 +345,7 @@ class HeliostatAccount:
         self._ordered.clear()
 
     def deadlines(self, now: float) -> list[tuple[str, float]]:
-        """Return the reasons why it has to leave, each with its time, s."""
+        """Return the reasons why the heliostat must leave, each with its start time, s."""
         causes = list(self._ordered.items())
         if now - self._served_at > SERVED:
             causes.append(("it was cut off", self._served_at))
@@ -347,5 +354,5 @@ class HeliostatAccount:
         return causes
 
     def must_stow(self, why: str) -> bool:
-        """Whether the reason requires stow, not only defocus."""
+        """Return whether a reason requires stow, and not only defocus."""
         return why not in ("DEFOCUS", UNLISTED)

@@ -1,4 +1,4 @@
-"""The observer of alarms: each alarm has a true cause, is raised for it, and ends with it.
+"""The observer of alarms: each alarm must have a true cause, and must end when its cause ends.
 
 An alarm exempts the heliostats that it names from the work checks (`twin.invariants.quiet`), so an
 alarm without a cause would hide any fault. The observer has a table of the alarms that simulated
@@ -89,7 +89,7 @@ class AlarmObserver(Judge):
         Boards by cluster name.
     worlds
         Worlds of the run. If a second plant runs at times, its alarms are reported here too, and it
-        takes over lines.
+        takes over the lines to the clusters.
 
     """
 
@@ -116,7 +116,7 @@ class AlarmObserver(Judge):
         self._called = False
 
     def on_alarm(self, alarm: Alarm, now: float) -> None:
-        """Note an alarm of the plant; it is judged at the next check.
+        """Record an alarm of the plant, to be judged at the next check.
 
         The same alarm may arrive twice: from the controller, and from the logbook, which also
         contains the alarms of automatic control.
@@ -133,12 +133,12 @@ class AlarmObserver(Judge):
             self._called &= alarm.condition != CALLED
 
     def on_call(self, owner: str, act: Act, now: float) -> None:
-        """Note that an operator has called an emergency."""
+        """Record that an operator has called an emergency."""
         del owner, act, now
         self._called = True
 
     def on_end(self, now: float) -> None:
-        """Note that the plant program, and with it its alarms, has ended."""
+        """Record that the plant program, and its alarms with it, has ended."""
         del now
         self._active.clear()
         self._last.clear()
@@ -147,7 +147,7 @@ class AlarmObserver(Judge):
         self._runs_since = inf  # it may start again before the next check
 
     def on_heard(self, cluster: str, now: float) -> None:
-        """Note a status that the plant has received."""
+        """Record a status that the plant has received."""
         self._heard[cluster] = now
 
     def look(
@@ -165,18 +165,18 @@ class AlarmObserver(Judge):
         Parameters
         ----------
         rest
-            When the last fault that concerns each heliostat ended, or will end, s.
+            When the last fault affecting each heliostat ended or will end, s.
         carried
-            Clusters that the plant reaches.
+            Clusters that the plant can reach.
         now
             s.
         runs
             Whether the plant program is running.
         writes
-            Whether the disk of its records writes in time; a slow disk completes its writes one by
-            one.
+            Whether the disk stores the plant's records in time; a slow disk completes its writes
+            one by one.
         files
-            What is wrong in the clusters' files; see `Pod.file`.
+            Errors in the clusters' files; see `Pod.file`.
         """
         self._wrote_at = self._wrote_at if writes else now
         rests = dict(rest)
@@ -209,7 +209,7 @@ class AlarmObserver(Judge):
                 self._named(name, max(self._well[cluster], self._runs_since), now, files)
 
     def contradicted(self, now: float, *, runs: bool) -> None:
-        """Check that an alarm names a time that is wrong in both the plant and the clusters."""
+        """Check that an alarm reports a time that is wrong in both the plant and the clusters."""
         self._runs_since = min(self._runs_since, now) if runs else inf
         named = any(kind == "sun_contradicted" for kind, _ in self._active)
         passed = now - self._runs_since
@@ -219,7 +219,7 @@ class AlarmObserver(Judge):
     def _caused(
         self, alarm: Alarm, rests: Mapping[str, float], now: float, *, called: bool
     ) -> None:
-        """Check that an alarm has a possible cause, names a subject, and is readable."""
+        """Check that an alarm has a possible cause, an existing subject, and a useful text."""
         kind, subject = alarm.condition, alarm.subject
         saw = f"{kind} is raised: {alarm.text}"
         known = kind in BY_FAULTS or kind in BY_OTHERS

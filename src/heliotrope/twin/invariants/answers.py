@@ -3,9 +3,9 @@
 A board replies to queries at one instant of virtual time, so its reply is compared with the true
 board at that instant: where its motors are and whether they turn, how long ago it booted and when
 the last sun vector left the cluster, how often it has booted, and what its journal contains. The
-rows and numbers in a cluster's status are compared with the replies that have reached the cluster
-and with the true time (invariant 11). The meaning of each bit, and all limits, are the observer's
-own.
+records and numbers in a cluster's status are compared with the replies that have reached the
+cluster and with the true time (invariant 11). The meaning of each bit, and all limits, are the
+observer's own.
 """
 
 import zlib
@@ -48,21 +48,21 @@ LATE, EARLY, CYCLE_MOST = 1.0, 0.3, 1.5
 
 @dataclass
 class _Board:
-    """One board: its account and its replies.
+    """One board: the observer's record of its heliostat, and the board's replies.
 
     Attributes
     ----------
     account
-        Its account.
+        The observer's record of the heliostat.
     moves_since, off_since
-        Since when it has reported that it is moving, and that its goals differ from its position,
-        s.
+        Time since which it has reported that it is moving; time since which it has reported goals
+        that differ from its position, s.
     told_at, goals
-        When it last reported its flags, s; the goals that it last reported.
+        When it last reported its flags, s; its last reported goals.
     boots, booted
-        The boot count that it last reported, and the account's boots and power cuts by then.
+        The last reported boot count, and the account's boots and power cuts at that time.
     steps
-        Times (s) and values of the STEPS that the cluster received.
+        Times (s) and values of the STEPS messages that the cluster received.
     """
 
     account: HeliostatAccount
@@ -90,9 +90,9 @@ class AnswerObserver(Judge):
     Attributes
     ----------
     quiet
-        Returns the heliostats in an undisturbed period; see `QuietObserver`.
+        Function that returns the heliostats in an undisturbed period; see `QuietObserver`.
     utc
-        Returns the true POSIX time, s.
+        Function that returns the true POSIX time, s.
     """
 
     def __init__(self, cluster: str, accounts: Sequence[HeliostatAccount], start: float) -> None:
@@ -105,7 +105,10 @@ class AnswerObserver(Judge):
         self._later: list[tuple[bool, str, str]] = []
 
     def _calmly(self, good: bool, subject: str, saw: str) -> None:
-        """Check at the next look, which knows of failures, what need not hold after a failure."""
+        """Queue a check that need not hold after a failure.
+
+        The next look, which knows of all failures, decides whether to judge it.
+        """
         if subject == self._cluster:
             calm = all(board.account.name in self.quiet() for board in self._boards.values())
         else:
@@ -114,7 +117,7 @@ class AnswerObserver(Judge):
             self._later.append((good, subject, saw))
 
     def look(self, now: float) -> None:
-        """Judge the replies since the last check if nothing has failed since then."""
+        """Judge the checks queued since the last look, unless something has failed."""
         later, self._later = self._later, []
         calm = self.quiet()
         whole = all(board.account.name in calm for board in self._boards.values())
@@ -125,7 +128,7 @@ class AnswerObserver(Judge):
     # -- the bus ---------------------------------------------------------------------------
 
     def heard(self, how: str, now: float) -> None:
-        """Note how bytes are about to reach a board, because a late frame may follow a reply."""
+        """Record whether bytes reach a board whole, since a late frame may follow a reply."""
         if how != "whole":
             self._late_at = now
 
@@ -282,7 +285,7 @@ class AnswerObserver(Judge):
         self._numbers(status)
 
     def _numbers(self, message: ClusterStatus) -> None:
-        """Judge the numbers of a cluster if nothing near it has failed."""
+        """Check the values in a cluster's status, unless something near the cluster has failed."""
         remaining = message.lease_left
         saw = f"{remaining:.2f} s are left of the plant's lease"
         self._calmly(LEASE_LEAST <= remaining <= LEASE_MOST, self._cluster, saw)

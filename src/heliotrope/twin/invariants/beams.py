@@ -2,8 +2,8 @@
 
 It knows the true heliostat (mechanism, joints, sun vector) and the orders that left the plant, each
 for a heliostat by name. Apart from the name of a board's state it uses nothing from the code under
-test, so a wrong clock, site, armature or address, and false step counts, appear as a beam that is
-off its position. It checks invariants 12 to 15.
+test, so an error in clock, site, armature, address or step counts appears as a beam that is off its
+position. The observer checks invariants 12 to 15.
 """
 
 import math
@@ -84,12 +84,13 @@ class _Mirror:
     Attributes
     ----------
     aims, standbys
-        Identities of orders and points: the last point that was reported as done, and all later.
+        Order identities with their points: the last point reported as done, and all later points.
     state, node, settled_at
-        State and program last seen; when it must have reached its commanded position, s.
+        Last state and program seen; when it must have reached its commanded position, s.
     elsewhere, approached
-        Whether its last motion led to step counts, not to its standby point; whether it has reached
-        its standby point along the path from stow since it was last without power or at stow.
+        Whether its last motion went to given step counts and not to its standby point; whether it
+        has reached its standby point along the path from stow since it last was without power or at
+        stow.
     astray_since, lit_since, inside_since
         Since when its beam has been off its position, on the receiver without an order, or inside a
         volume, s.
@@ -98,17 +99,18 @@ class _Mirror:
     named_at
         When an alarm last named it, s.
     ordered_at, off_at, resumed_at
-        When the plant last sent it an order, and one that takes it off the receiver; when an
-        operator last sent it there, s.
+        When the plant last sent it any order; when the plant last ordered it off the receiver; when
+        an operator last sent it to the receiver, s.
     lost_at
         When it last left TRACKING or SEARCHING without an order, s.
     assigned, assigned_at
         Whether an operator has put it under automatic control, and since when, s.
     up, changed_at, reports, seen_up
-        Whether it is up, since when, s, and how often that was reported; whether automatic control
-        has seen it up since the plant last took it off.
+        Whether it is up, since when, s, and how many reports have said so; whether automatic
+        control has seen it up since the plant last took it off the receiver.
     called_at, uncalled
-        When the plant last sent its beam to a point, s; whether it went there without that.
+        When the plant last sent its beam to a point, s; whether the beam went to a point without an
+        order.
     shines_since
         Since when its beam is on the receiver while an emergency holds, s.
     """
@@ -148,16 +150,18 @@ class _Mirror:
 
     @property
     def elsewhere_idle(self) -> bool:
-        """Whether it is IDLE and holds still, wherever that is."""
+        """Whether the heliostat is IDLE and holds still, in any position."""
         return self.state == states.IDLE and (self.elsewhere or not self.approached)
 
 
 def slew(board: Board, sun: FloatArray, point: Point) -> float:
-    """Return the least time that the drives need to bring a beam to a point, s; 0 if they cannot.
+    """Return the shortest time in which the drives can bring a beam to a point, s.
+
+    The time is 0 if the point is out of reach.
 
     Near the zenith, in the keyhole, a small beam movement takes half a turn of the azimuth, or more
-    if a stop blocks the shorter direction. Two poses reach the point; the true heliostat's faster
-    one counts, at the lowest rate of the boards, with its ramp.
+    if a stop blocks the shorter direction. Two poses reach the point; the result is for the pose
+    that the true heliostat reaches sooner, at the boards' lowest rate and with the ramp.
     """
     mechanism, (rate, acceleration, _) = board.outfit.mechanism, LIMITS
     low, high = np.transpose(RANGES)
@@ -190,15 +194,15 @@ class BeamObserver(Judge):
         Number of heliostats that automatic control may lose together and raise again without an
         operator; None: only operators command.
     unsurveyed
-        Heliostats about which the plant file is wrong. Until they are calibrated, their beams are
-        off their intended positions, by at most the effect of that error.
+        Heliostats about which the plant file is wrong. Until they are calibrated, their beams may
+        be off by as much as that error causes.
 
     Attributes
     ----------
     losses
         Number of losses after which the field waits for an operator.
     proofs
-        Number of emergency orders for which every heliostat was reported as done.
+        Number of emergency orders that every heliostat was confirmed to have carried out.
     contradicted
         Whether a witness contradicts the time that plant and clusters share. In that case no
         heliostat may join the receiver, and the positions of idle beams are unknown. Set by the
@@ -235,7 +239,7 @@ class BeamObserver(Judge):
     # -- orders, reports and alarms ----------------------------------------------------------
 
     def on_command(self, message: Command, heliostats: Sequence[str], now: float) -> None:
-        """Note a command that has left the plant."""
+        """Record a command that has left the plant."""
         for name in heliostats:
             mirror = self._mirrors[name]
             mirror.ordered_at = now
@@ -253,7 +257,7 @@ class BeamObserver(Judge):
                 mirror.elsewhere = True
 
     def on_emergency(self, name: str, heliostats: Sequence[str], now: float) -> None:
-        """Note a DEFOCUS or STOW from the plant."""
+        """Record a DEFOCUS or STOW from the plant."""
         del name
         for heliostat in heliostats or self._mirrors:
             mirror = self._mirrors[heliostat]
@@ -265,42 +269,42 @@ class BeamObserver(Judge):
     def on_accepted(
         self, person: Person, token: int, ticket: Ticket, what: str, now: float
     ) -> None:
-        """Note an operator command that the plant has accepted."""
+        """Record an operator command that the plant has accepted."""
         del person, token
         if what not in ("ROUGH", "PARAMETERS"):
             self.resumed(ticket.heliostats, what, now)
 
     def on_safe(self, person: Person, ticket: Ticket, what: str, now: float) -> None:
-        """Note an operator's DEFOCUS or STOW, which ends automatic control of the heliostats."""
+        """Record an operator's DEFOCUS or STOW, which ends automatic control of its heliostats."""
         del person, what, now
         self.taken(ticket.heliostats)
 
     def on_call(self, owner: str, act: Act, now: float) -> None:
-        """Note an operator's emergency, which removes all heliostats from automatic control."""
+        """Record an operator's emergency, which removes all heliostats from automatic control."""
         del owner, act, now
         self.taken(self._mirrors)
 
     def resumed(self, heliostats: Iterable[str], what: str, now: float) -> None:
-        """Note an operator command that the plant has accepted."""
+        """Record an operator command that the plant has accepted."""
         self.taken(heliostats)
         if what in _RESUMES:
             for name in heliostats:
                 self._mirrors[name].resumed_at = now
 
     def taken(self, heliostats: Iterable[str]) -> None:
-        """Note that an operator commands heliostats, which automatic control may no longer move."""
+        """Record that an operator commands heliostats; automatic control may not move them now."""
         for name in heliostats:
             self._mirrors[name].assigned = False
 
     def given(self, heliostats: Iterable[str], now: float) -> None:
-        """Note that an operator has put heliostats under automatic control, without any losses."""
+        """Record that an operator puts heliostats under automatic control, with no losses yet."""
         for name in heliostats:
             mirror = self._mirrors[name]
             if not mirror.assigned:
                 mirror.assigned, mirror.assigned_at = True, now
 
     def released(self, now: float) -> None:
-        """Note that an operator lets automatic control resume after a loss."""
+        """Record that an operator lets automatic control resume after a loss."""
         self._departures.clear()
         self._released_at = now
         for mirror in self._mirrors.values():
@@ -309,9 +313,10 @@ class BeamObserver(Judge):
                 mirror.seen_up = False
 
     def on_status(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
-        """Note a report that the plant has received, which is what automatic control can know.
+        """Record a report to the plant, the only source of what automatic control can know.
 
-        The true states determine what is lost; the report only determines since when that is known.
+        The true states determine which heliostats are lost; the report only determines since when
+        automatic control knows.
         """
         for name, row in zip(names, status.nodes(), strict=True):
             mirror, age = self._mirrors.get(name), 1e-3 * int(row["heard_ms"])
@@ -324,7 +329,7 @@ class BeamObserver(Judge):
                     self._known(mirror, now)
 
     def _known(self, mirror: _Mirror, now: float) -> None:
-        """Note that automatic control knows by now whether a heliostat is up."""
+        """Record that automatic control now knows whether a heliostat is up."""
         lost, mirror.seen_up = mirror.seen_up and not mirror.up, mirror.up
         at = mirror.changed_at
         lost = lost and mirror.assigned and at >= max(mirror.assigned_at, self._released_at)
@@ -339,7 +344,7 @@ class BeamObserver(Judge):
             self.losses += 1
 
     def on_progress(self, message: Progress, now: float) -> None:
-        """Drop the points before the point that is reported as done."""
+        """Drop all points older than the point that is reported as done."""
         del now
         if message.stage is not Stage.DONE:
             return
@@ -351,19 +356,22 @@ class BeamObserver(Judge):
                         points.popleft()
 
     def on_alarm(self, alarm: Alarm, now: float) -> None:
-        """Note an alarm of the plant."""
+        """Record an alarm of the plant."""
         self._alarms[alarm.condition, alarm.subject] = (now, alarm.active)
 
     def stalled(self, heliostat: str) -> None:
-        """Note that a drive has stalled, which only the flux reveals; the whole proof is judged."""
+        """Record that a drive has stalled, which only the flux reveals.
+
+        The heliostat is then exempt, except when all heliostats are confirmed as done.
+        """
         self._stalled.add(heliostat)
 
     def exchanged(self, heliostat: str) -> None:
-        """Note that a heliostat has another heliostat's board, so its beam position is unknown."""
+        """Record that a heliostat has another's board, so its beam position is unknown."""
         self._exchanged.add(heliostat)
 
     def on_end(self, now: float) -> None:
-        """Note that the plant program, and with it its alarms, has ended.
+        """Record that the plant program, and its alarms with it, has ended.
 
         The next program must name each heliostat with doubtful step counts again, within the usual
         time.
@@ -387,7 +395,7 @@ class BeamObserver(Judge):
         Parameters
         ----------
         plant
-            The plant; None: it is not running.
+            The plant; None if it is not running.
         carried
             Clusters that the plant can reach.
         now
@@ -425,7 +433,7 @@ class BeamObserver(Judge):
             self._proofs(plant, sun, now)
 
     def _stays_off(self, mirror: _Mirror, now: float) -> None:
-        """Check that neither a wrong sun nor another heliostat's parameters bring a beam up."""
+        """Check that no heliostat tracks on a wrong sun direction or another's parameters."""
         node, own = mirror.node, mirror.board.outfit.items["armature"]
         foreign = node is not None and node.journal.items.get("armature") != own
         by = "a sun that is contradicted" if self.contradicted else "another mirror's parameters"
@@ -436,7 +444,7 @@ class BeamObserver(Judge):
         self.check(12, good, now, mirror.name, f"{states.STATES[mirror.state]}, by {by}")
 
     def _enters(self, mirror: _Mirror, state: int, now: float) -> None:
-        """Note a new state."""
+        """Record a new state."""
         before, mirror.state = mirror.state, state
         if state == before:
             return
@@ -461,7 +469,7 @@ class BeamObserver(Judge):
                 self._departures.append((now, mirror.name))
 
     def _parted(self, mirror: _Mirror, now: float) -> None:
-        """Check that beams do not all turn the same way, which would make a hot spot elsewhere."""
+        """Check that beams do not all turn away alike, which would make a hot spot elsewhere."""
         aside = [m.node for m in self._mirrors.values() if m.board.state == states.DEFOCUSED]
         turns = [node.journal.items.get("defocus") for node in aside if node is not None]
         known = [turn for turn in turns if turn is not None]
@@ -469,7 +477,7 @@ class BeamObserver(Judge):
         self.check(13, len(known) < _MANY or len(set(known)) > 1, now, mirror.name, saw)
 
     def _returns(self, mirror: _Mirror, now: float) -> None:
-        """Check that a heliostat returns to the receiver on an operator's order, if needed."""
+        """Check that a heliostat lost from the receiver returns only on an operator's order."""
         known = self._lost_at + TOLD_WITHIN if self._most is None else self._lost_known_at
         losses = [(self._lost_at, known, "the field")]
         if self._most is None:
@@ -486,7 +494,7 @@ class BeamObserver(Judge):
             self.check(14, good, now, mirror.name, saw)
 
     def _placed(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
-        """Check that a beam that was sent to a point is there, or is named by an alarm and off.
+        """Check that a beam sent to a point is there; otherwise an alarm names it and it is off.
 
         A heliostat at standby is off if its beam is neither on the receiver nor in a volume. If its
         step counts are wrong, no order can bring it to a better position, so only an active alarm
@@ -523,16 +531,16 @@ class BeamObserver(Judge):
         self.check(12, off or passed <= OFF_WITHIN, now, mirror.name, beside)
 
     def _doubted(self, mirror: _Mirror) -> bool:
-        """Whether an alarm names a heliostat because of its step counts."""
+        """Return whether an alarm names a heliostat because of its step counts."""
         return self._alarms.get((alarms.COUNTS_DOUBTFUL.name, mirror.name), (0.0, False))[1]
 
     def _lights(self, mirror: _Mirror, sun: FloatArray) -> bool:
-        """Whether a beam is on the receiver or inside a volume."""
+        """Return whether a beam is on the receiver or inside a keep-out volume."""
         inside = any(mirror.board.miss(sun, at) <= radius for at, radius in self._keep_outs)
         return inside or mirror.board.miss(sun, RECEIVER) <= OFF
 
     def _dark(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
-        """Check that a beam that nobody sent to the receiver, or into a volume, leaves."""
+        """Check that a beam leaves the receiver or a volume if nobody sent it there."""
         board, sent = mirror.board, mirror.state in _ON
         shines = not sent and board.miss(sun, RECEIVER) <= OFF
         mirror.lit_since = _since(shines, mirror.lit_since, now)
@@ -548,7 +556,7 @@ class BeamObserver(Judge):
             self.check(13, passed <= OFF_WITHIN, now, mirror.name, saw)
 
     def _loss(self, on: int, now: float) -> None:
-        """Note a loss that took every heliostat (at least two) off the receiver."""
+        """Record a loss that took every heliostat (at least two) off the receiver."""
         while self._departures and now - self._departures[0][0] > TOGETHER:
             self._departures.popleft()
         if on == 0 and len({name for _, name in self._departures}) >= 2:
@@ -589,7 +597,7 @@ class BeamObserver(Judge):
             self.check(15, good or now - begin <= DONE_WITHIN, now, mirror.name, saw)
 
     def _complete(self, order: EmergencyOrder, sun: FloatArray, now: float, *, holds: bool) -> None:
-        """Check that the beams confirmed as done, singly or all, are off the receiver."""
+        """Check that beams confirmed as done, one by one or all together, are off the receiver."""
         complete = holds and order.report(now).complete
         if complete and order.ticket.identity != self._complete_order:
             self.proofs, self._complete_order = self.proofs + 1, order.ticket.identity

@@ -1,8 +1,8 @@
 """The observer of the day: automatic control has the field at stow while the sun is low.
 
-It knows from the operators what they have put under automatic control, and what they have done to
-it since; and it knows the elevation of the sun, the boards, and which periods are undisturbed
-(`quiet`). It shares no limit with the code under test (invariant 16).
+The observer learns from the operators which heliostats they have put under automatic control, and
+what they have done to them since. It also knows the sun's elevation, the boards, and which periods
+are undisturbed (`quiet`). Its limits are its own, not those of the code under test (invariant 16).
 """
 
 from collections.abc import Iterable, Sequence, Set
@@ -52,17 +52,17 @@ class DayObserver(Judge):
         self._low_at, self._acted_at = inf, -inf
 
     def given(self, heliostats: Iterable[str], now: float) -> None:
-        """Note that an operator has put heliostats under automatic control."""
+        """Record that an operator has put heliostats under automatic control."""
         for name in heliostats:
             self._assigned.setdefault(name, now)
 
     def taken(self, heliostats: Iterable[str]) -> None:
-        """Note that an operator has moved heliostats, whose positions are then not judged."""
+        """Record that an operator has moved heliostats, whose positions are then not judged."""
         for name in heliostats:
             self._assigned.pop(name, None)
 
     def took(self, now: float) -> None:
-        """Note that an operator holds or requests the command authority."""
+        """Record that an operator holds or requests the command authority."""
         self._acted_at = now
 
     def look(
@@ -73,7 +73,7 @@ class DayObserver(Judge):
         Parameters
         ----------
         plant
-            The plant; None: it is not running.
+            The plant; None if it is not running.
         quiet
             Heliostats in an undisturbed period.
         sun

@@ -1,60 +1,60 @@
 """The seventeen safety invariants, and an independent observer of the first eleven.
 
 The observer sees the frames on the bus, the actions of each board, and the messages to and from the
-plant. It keeps its own accounts in true time and trusts no report: the age of a sun counts from
-when the cluster sent it, a heliostat is defocused when its beam misses the receiver, a duplicate is
-a frame that was received before.
+plant. It keeps its own accounts in true time and trusts no report: a sun vector's age counts from
+when the cluster sent it, a heliostat is defocused when its beam misses the receiver, and a
+duplicate is a frame that was received before.
 
 ========  ============================================================================
 number    check
 ========  ============================================================================
-1         In a state that needs the sun, the last sun is not older than the lease.
+1         In a state that needs the sun, the last sun vector is not older than the lease.
 2         A heliostat that is cut off from plant or cluster, or ordered off, is off the
-          receiver in 30 s and at stow in 5 min.
-3         TRACKING and SEARCHING, and every way out of STOWED and FAULT, begin with a genuine
-          command at that instant.
+          receiver within 30 s and at stow within 5 min.
+3         TRACKING and SEARCHING, and every transition out of STOWED and FAULT, begin with a
+          genuine command at that instant.
 4         DEFOCUS and STOW act at once, whoever sends them; nothing else acts without authority,
-          and of two plants with the same keys one is obeyed at a time.
+          and of two plants with the same keys, only one is obeyed at a time.
 5         Duplicate, late, replayed and expired commands change nothing.
 6         A damaged frame changes nothing.
-7         After a boot the state is a safe one, the journal holds the old or the new record, and
+7         After a boot the state is safe, the journal contains the old or the new record, and
           the step counts are right to within their stated uncertainty.
-8         Steps keep to range, rate and acceleration; counted steps are those that were ordered.
-9         As 1, and the plant's lease too, while a clock or counter has jumped; no sun is sent by a
-          time that has jumped before a person has acknowledged it.
-10        Azimuth moves first from stow and last to stow; the beam goes by the foot of the way, and
-          crosses the receiver only once it has come to its standby point.
-11        Every command on the bus was accepted and reported once; no value is reported younger
-          or other than it is, by boards, clusters or the plant. Where nothing fails
-          (`world.tour`) it is done in time.
-12        A beam in a state that lights anything is where it was sent; otherwise an alarm names
-          it within 10 s and it is off within 30 s.
-13        In no state does a beam that was not ordered there stay on the receiver, or any beam
-          in a keep-out volume, for 30 s; the beams that turn away part.
-14        After a loss of more mirrors than automatic control may raise again, or of all, only a
-          person brings one back.
-15        A mirror proven to be done is off the receiver, or at stow.
-16        In quiet stretches what was ordered is done; a kept sighting is the mirror's own; while
-          the sun is low, what automatic control was given is at stow. Alarms have causes, and
-          causes have alarms; each command ends, and says why it failed.
-17        What a person has ordered or locked stands until its owner, or an engineer by name, has
-          ended it: the emergency holds, and the locked mirror stands still.
+8         Steps stay within range, rate and acceleration; counted steps equal ordered steps.
+9         As 1, and also for the plant's lease, after a jump of a clock or counter; no sun vector
+          is sent for a time that has jumped until an operator has acknowledged the jump.
+10        Azimuth moves first from stow and last to stow; the beam passes the foot of the safe
+          path, and crosses the receiver only after it has reached its standby point.
+11        Every command on the bus was accepted and reported once; boards, clusters and the plant
+          report every value as it is, with its true age. If nothing fails (`world.tour`), each
+          command is carried out in time.
+12        A beam in a state in which it lights anything is where it was sent; otherwise an alarm
+          names the heliostat within 10 s, and the beam is off within 30 s.
+13        In no state does a beam stay on the receiver for 30 s without an order, or in a keep-out
+          volume at all for 30 s; beams that turn away diverge.
+14        After a loss of all heliostats, or of more than automatic control may raise again, only
+          an operator brings them back.
+15        A heliostat confirmed as done is off the receiver, or at stow.
+16        In undisturbed periods, orders are carried out; a stored sighting shows the heliostat's
+          own beam; while the sun is low, heliostats under automatic control are at stow. Alarms
+          have causes, and causes have alarms; each command ends, and a failed one says why.
+17        An operator's order or lock stands until its owner, or an engineer by name, has ended
+          it: the emergency stays in force, and the locked heliostat stands still.
 ========  ============================================================================
 
-Besides being safe, life must go on:
+Besides being safe, the plant must keep working:
 
 ========  ============================================================================
-L1        What a visit or a person took is given back: no mirror stays LOCKED, or its beam on
-          a target, without an owner that the page shows.
-L2        Each ticket ends, and DONE is true; each retry has an end; no alarm has the plant's
-          own act as its cause.
-L3        When the last cause is gone and a person has resumed, every healthy mirror that
-          automatic control has tracks the receiver again.
-L4        What holds for safety outlives a restart of the plant's program.
+L1        Every heliostat that a visit or an operator took is released: none stays LOCKED, or
+          leaves its beam on a target, without an owner that the page shows.
+L2        Each ticket ends, and DONE is true; retries end; no alarm is caused by the plant's own
+          action.
+L3        When the last cause is gone and an operator has resumed, every healthy heliostat under
+          automatic control tracks the receiver again.
+L4        Emergencies and locks survive a restart of the plant program.
 ========  ============================================================================
 
 `twin.invariants.beams` checks 12 to 15, `twin.invariants.quiet`, `.visits`, `.day`, `.alarms` and
-`.tickets` 16, `twin.invariants.persons` 17, and `twin.invariants.answers` 11.
+`.tickets` check 16, `twin.invariants.persons` checks 17, and `twin.invariants.answers` checks 11.
 """
 
 from collections import Counter, deque
@@ -225,20 +225,21 @@ class Violation:
 class Judge:
     """Base of the observers: counts checks, and raises at the first broken invariant.
 
-    What happens at a plant comes by the hooks ``on_…``, which do nothing here: an observer replaces
-    those that concern it, and whoever sees an event calls its hook of every observer in turn.
+    Events at a plant arrive through the hooks ``on_…``, which do nothing here. An observer
+    overrides the hooks that concern it; the part of the simulation that sees an event calls the
+    hook of every observer in turn.
 
     Parameters
     ----------
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
 
     Attributes
     ----------
     checks
         Number of checks of each invariant.
     start
-        As given.
+        Origin of the reported times, s.
     """
 
     def __init__(self, start: float) -> None:
@@ -260,53 +261,53 @@ class Judge:
     # -- the plant's end of a line -----------------------------------------------------------
 
     def on_lease(self, token: int, now: float) -> None:
-        """Note a lease that has left the plant."""
+        """Record a lease that has left the plant."""
 
     def on_emergency(self, name: str, heliostats: Sequence[str], now: float) -> None:
-        """Note DEFOCUS or STOW from the plant."""
+        """Record a DEFOCUS or STOW from the plant."""
 
     def on_command(self, message: Command, heliostats: Sequence[str], now: float) -> None:
-        """Note a command that has left the plant."""
+        """Record a command that has left the plant."""
 
     def on_write(self, heliostat: str, what: str, now: float) -> None:
-        """Note what has left the plant to be stored by a heliostat."""
+        """Record a message from the plant whose contents a heliostat is to store."""
 
     def on_heard(self, cluster: str, now: float) -> None:
-        """Note a status, of whatever content, that has reached the plant."""
+        """Record that a status, whatever its content, has reached the plant."""
 
     def on_status(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
-        """Note the reports of named heliostats that have reached the plant."""
+        """Record a status of named heliostats that has reached the plant."""
 
     def on_progress(self, message: Progress, now: float) -> None:
-        """Note a report to the plant about a command."""
+        """Record a report to the plant about a command."""
 
     # -- the plant's program and its operators -------------------------------------------------
 
     def on_alarm(self, alarm: Alarm, now: float) -> None:
-        """Note an alarm of the plant."""
+        """Record an alarm of the plant."""
 
     def on_end(self, now: float) -> None:
-        """Note that the plant's program has ended."""
+        """Record that the plant program has ended."""
 
     def on_accepted(
         self, person: Person, token: int, ticket: Ticket, what: str, now: float
     ) -> None:
-        """Note a command of an operator that the plant has accepted."""
+        """Record an operator command that the plant has accepted."""
 
     def on_safe(self, person: Person, ticket: Ticket, what: str, now: float) -> None:
-        """Note DEFOCUS or STOW by an operator, which needs no authority."""
+        """Record a DEFOCUS or STOW by an operator, which needs no authority."""
 
     def on_refused(
         self, person: Person, token: int, asked: tuple[str, Sequence[str]], reason: str, now: float
     ) -> None:
-        """Note a refusal of a command (name and heliostats), and its reason."""
+        """Record that a command (name and heliostats) was refused, and the reason."""
 
     def on_call(self, owner: str, act: Act, now: float) -> None:
-        """Note an emergency that an operator has raised."""
+        """Record an emergency that an operator has called."""
 
 
 class Observer(Judge):
-    """Listens to bus, boards and plant, and raises at the first violated invariant.
+    """Observes the bus, the boards and the plant, and raises at the first violated invariant.
 
     It is a `twin.boards.bus.Tap` and a `twin.boards.board.Witness`; `look` is called every half
     second.
@@ -325,7 +326,7 @@ class Observer(Judge):
     Attributes
     ----------
     frames, orders, runs
-        The ledgers, and the record of the plant runs.
+        The ledgers of frames and orders, and the record of the plant's runs.
     leased_at
         When the plant last sent a lease on a healthy line, s.
     jumped_at, disturbed_at
@@ -358,19 +359,19 @@ class Observer(Judge):
             account.board.witness = self
 
     def call(self, names: Mapping[int, str]) -> None:
-        """Call each heliostat by the name that the cluster uses for its address."""
+        """Set the names that the cluster uses for its heliostats' addresses."""
         for account in self.accounts:
             account.name = account.written = names[account.address]
 
     def doubt(self, board: Board) -> None:
-        """Note that a heliostat has another board, or that a drive has stalled.
+        """Record that a heliostat has another board, or that a drive has stalled.
 
-        The board stores other values than before, and the position of its beam is unknown.
+        Another board stores other values, and in either case the position of the beam is unknown.
         """
         self._by_address[board.outfit.address].unsure = True
 
     def edited(self, file: Mapping[str, str], now: float) -> None:
-        """Note what is wrong in the file with which the cluster now starts; see `Pod.file`.
+        """Record the errors in the file with which the cluster now starts; see `Pod.file`.
 
         A heliostat that is missing from the file is no longer addressed, so it counts as cut off.
         """
@@ -400,19 +401,19 @@ class Observer(Judge):
         elif sent.who in (messages.AUTHORITY, messages.KEY):
             self._authorised(sent, now)
         elif sent.who == messages.ANYONE:
-            # Who is to stow need not defocus first.
+            # A heliostat that is to stow need not defocus first.
             over = ("DEFOCUS", "STOW") if sent.name == "STOW" else (sent.name,)
             self._emergencies = [
                 emergency for emergency in self._emergencies if emergency[0] not in over
             ]
 
     def _authorised(self, sent: Sent, now: float) -> None:
-        """Check a command on the bus: ordered with authority, in time, and reported."""
-        pushed = sent.who == messages.KEY and sent.name != "ZERO"  # a person declares counts
+        """Check that a command on the bus was ordered with authority, in time, and reported."""
+        pushed = sent.who == messages.KEY and sent.name != "ZERO"  # an operator declares the counts
         name = "PARAMETERS" if pushed else sent.name
         addresses = [a.address for a in self.accounts if sent.addresses(a.address)]
         orders = self.orders.covering(name, addresses, now)
-        if name == "STANDBY":  # a pushed standby point goes out as the command does
+        if name == "STANDBY":  # a standby point set as a parameter is sent like the command
             orders = [*orders, *self.orders.covering("PARAMETERS", addresses, now)]
         where = f"{sent.name} to {sent.to}"
         allowed = [order for order in orders if order.authorised]
@@ -427,11 +428,11 @@ class Observer(Judge):
             self._unreported.append((now, where, addresses, fresh))
 
     def heard(self, place: int, data: bytes, how: str, now: float) -> None:
-        """Note the bytes that a board is about to receive, and its state before them."""
+        """Record the bytes that a board is about to receive, and its state before it does."""
         account = self.accounts[place]
         sent = self.frames.of(data)
         if how == "damaged" and sent is not None:
-            how = "whole"  # the noise hit nothing
+            how = "whole"  # the noise hit no frame
         account.in_hand, account.how = sent, how
         account.forged = None
         if account.board.node is None:
@@ -449,7 +450,7 @@ class Observer(Judge):
         account.good = account.board.node.reader.good
 
     def _expects_quiet(self, account: HeliostatAccount, sent: Sent | None, how: str) -> int:
-        """Return the invariant that forbids a frame any change, 0 if it may act."""
+        """Return the invariant under which a frame must change nothing; 0 if it may act."""
         if how == "damaged":
             return 6
         if how == "forged":
@@ -463,7 +464,7 @@ class Observer(Judge):
             return 5
         node = account.board.node
         if sent.name == "SESSION" and node is not None and node.controller.gate is not None:
-            # A late SESSION of a cluster that has restarted since is news to the board.
+            # A late SESSION of a cluster that has restarted since is new to the board.
             return 5 if sent.values[0] < node.controller.gate.replay.epoch else 0
         return 5 if sent.index <= account.taken else 0
 
@@ -473,9 +474,9 @@ class Observer(Judge):
         return fingerprint(account.board, gate=how in ("damaged", "twice"), clock=not by_cluster)
 
     def answered(self, data: bytes, how: str, now: float) -> None:
-        """Note a reply that the master has received."""
+        """Record a reply that the master has received."""
         frames = wire.Reader().feed(data)
-        # If a late answer came first, only the last frame is current.
+        # If a late reply came first, only the last frame is current.
         for frame in frames[-1:] if how == "late" else frames:
             account = self._by_address.get(frame.sender)
             values = frame.values() if frame.name == "STATUS" else None
@@ -548,7 +549,7 @@ class Observer(Judge):
         account.quiet = 0
 
     def _changed(self, account: HeliostatAccount, now: float, heard: bool) -> None:
-        """Check a transition: by a command at this instant, or allowed by `FREE`."""
+        """Check a state transition: commanded at this instant, or allowed by `FREE`."""
         before, after = account.state, account.board.state
         account.entered(after, now)
         self.entered[after] += 1
@@ -575,7 +576,7 @@ class Observer(Judge):
         self.check(3, good, now, account.name, saw)
 
     def _leases(self, account: HeliostatAccount, now: float) -> None:
-        """Check that a state that needs the sun has a fresh one."""
+        """Check that a heliostat in a state that needs the sun has a fresh sun vector."""
         if account.board.state in NEED_SUN:
             age = now - account.sun_at
             state = states.STATES[account.board.state]
@@ -604,7 +605,7 @@ class Observer(Judge):
     def stepped(
         self, board: Board, axis: int, direction: int, count: int, interval_us: int
     ) -> None:
-        """Check a segment of steps: range, rate, and the order of the axes."""
+        """Check a segment of steps: its range, its rate, and the order of the axes."""
         account, now = self._by_address[board.outfit.address], board.now
         name, which = account.name, ("azimuth", "elevation")[axis]
         rate = 1e6 / max(1, interval_us)
@@ -626,16 +627,16 @@ class Observer(Judge):
     # -- the plant -------------------------------------------------------------------------
 
     def on_lease(self, token: int, now: float) -> None:
-        """Note a lease that the plant has sent on a working line."""
+        """Record a lease that the plant has sent on a working line."""
         del token
         self.leased_at = now
 
     def ordered(self, order: PlantCommand) -> None:
-        """Note an order of the plant."""
+        """Record an order of the plant."""
         self.orders.note(order)
 
     def given_stow(self, heliostat: str, stow: tuple[int, int]) -> None:
-        """Note a stow position, steps, that was sent to a heliostat."""
+        """Record a stow position, in steps, that was sent to a heliostat."""
         for account in self.accounts:
             if account.name == heliostat:
                 account.stows.add(stow)
@@ -643,7 +644,10 @@ class Observer(Judge):
     def emergency(
         self, name: str, now: float, *, carried: bool, heliostats: Iterable[str] = ()
     ) -> None:
-        """Note a DEFOCUS or STOW of heliostats (() for all); ``carried``: line and cluster work."""
+        """Record a DEFOCUS or STOW of heliostats, or of all if ``addresses`` is ().
+
+        ``carried`` means that the line and the cluster work.
+        """
         if carried:
             self._emergencies.append((name, now))
         whom = set(heliostats)
@@ -652,22 +656,22 @@ class Observer(Judge):
                 account.must(name, now)
 
     def jumped(self, now: float, place: int | None = None) -> None:
-        """Note a jump of a clock, or of the counter of a board."""
+        """Record a jump of a clock, or of a board's counter."""
         self.jumped_at = now
         if place is not None:
             self.accounts[place].jumped()
 
     def time_jumped(self, now: float) -> None:
-        """Note a jump of the cluster's time that it must notice."""
+        """Record a jump of the cluster's time that the cluster must notice."""
         self.jumped(now)
         self._dark_since = min(self._dark_since, now)
 
     def time_acknowledged(self) -> None:
-        """Note that an operator has acknowledged the jump."""
+        """Record that an operator has acknowledged the jump."""
         self._dark_since = float("inf")
 
     def disturbed(self, now: float, *, crashed: bool = False) -> None:
-        """Note a failure of line, bus or cluster, which cancels what the cluster was due to do."""
+        """Record a failure of line, bus or cluster; it cancels what the cluster had still to do."""
         self.disturbed_at = now
         self._emergencies.clear()
         if crashed:
@@ -696,7 +700,7 @@ class Observer(Judge):
                     self.check(11, reached, now, subject, saw)
 
     def on_status(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
-        """Check a status report to the plant: each heliostat's age and state must be true."""
+        """Check a status report to the plant: each reported age and state must be true."""
         by_name = {account.name: account for account in self.accounts}
         for name, row in zip(names, status.nodes(), strict=True):
             account = by_name.get(name)
@@ -705,8 +709,8 @@ class Observer(Judge):
             age = int(row["heard_ms"]) / 1000.0
             claimed = now - age
             last = account.statuses[-1][0] if account.statuses else float("-inf")
-            # The age counts from when it was written: it waits for a connection until the next
-            # status is made, and may then be in transit for its lifetime.
+            # The age counts from when the status was written. A status waits for a connection until
+            # the next status is made, and may then be in transit for its lifetime.
             slack = 2.0 * STATUS_LIFE + AGE_ROUNDING
             saw = f"its state is reported as {age:.2f} s old and is {now - last:.2f} s old"
             self.check(11, claimed <= last + slack, now, name, saw)
@@ -738,7 +742,7 @@ class Observer(Judge):
                 self._due(account, sun, now, leased)
 
     def _reported(self, now: float) -> None:
-        """Check that all commands on the bus were reported, if line and cluster worked."""
+        """Check that all commands on the bus were reported, if the line and the cluster worked."""
         while self._unreported and now - self._unreported[0][0] > ORDER_WITHIN:
             at, where, addresses, orders = self._unreported.popleft()
             if min(order.at for order in orders) <= self.disturbed_at:
@@ -749,12 +753,12 @@ class Observer(Judge):
             self.check(11, reported, now, "cluster", saw)
 
     def _counted(self, account: HeliostatAccount, now: float) -> None:
-        """Check that counted steps are those that were handed to the timers."""
+        """Check that each board's step counts agree with the steps handed to its timers."""
         board = account.board
         assert board.node is not None
         motion = board.node.controller.motion
         if not motion.known:
-            return  # it turns away by steps that it counts from anywhere
+            return  # it turns away by steps counted from an arbitrary origin
         for i in (0, 1):
             ordered = board.axes[i].emitted - board.slip[i]
             counted = motion.place(i)
@@ -762,11 +766,11 @@ class Observer(Judge):
             self.check(8, ordered == counted, now, account.name, saw)
 
     def _due(self, account: HeliostatAccount, sun: FloatArray, now: float, leased: bool) -> None:
-        """Check that heliostats that are cut off or ordered off leave, and stow, in time."""
+        """Check that heliostats that are cut off or ordered off leave, and reach stow, in time."""
         board, name = account.board, account.name
         account.served(now, leased)
         assert board.node is not None
-        # Unknown counts tell nothing of the pose: there the true beam counts, with its error.
+        # Unknown counts say nothing about the pose, so the true beam is judged, with its error.
         known = board.node.controller.motion.known
         on_way = board.state in (states.APPROACHING, states.IDLE) and account.from_stow
         sure = not account.unsure
@@ -779,7 +783,8 @@ class Observer(Judge):
             state = states.STATES[board.state]
             if passed > DEFOCUS_WITHIN:
                 saw = f"{state} {passed:.1f} s after {why}, limit {DEFOCUS_WITHIN:g} s"
-                # What no file names must not stay at standby either: nobody can take it from there.
+                # A heliostat that no file names must not stay at standby either, as nobody can move
+                # it away.
                 up = ON_THE_WAY if why == UNLISTED else NEED_SUN
                 self.check(2, board.state not in up, now, name, saw)
                 miss = board.miss(sun, RECEIVER, believed=known)
@@ -807,12 +812,12 @@ class Observer(Judge):
             self.check(10, miss > OFF, now, name, saw)
 
 
-#: Columns of a row that are reported as STATUS has them.
+#: Columns of a record that are reported exactly as in STATUS.
 _TOLD = ("state", "flags", "fault", "armature_crc", "boots")
 
 
 def _row_of(values: "tuple[Any, ...]") -> tuple[int, ...]:
-    """Return the columns of a row after a STATUS; see `_TOLD`."""
+    """Return the columns that a STATUS fills in a cluster's record; see `_TOLD`."""
     state, flags, fault, *_, armature_crc, boots = values
     return state, flags, fault, armature_crc, boots
 
@@ -823,7 +828,7 @@ def _first(data: bytes) -> wire.Frame | None:
 
 
 def _difference(before: "dict[str, object]", after: "dict[str, object]") -> str:
-    """Return the differences in words."""
+    """Return the differences between two records in words."""
     return ", ".join(
         f"{key} from {before[key]!r} to {after[key]!r}"
         for key in before

@@ -1,4 +1,4 @@
-"""Ledgers of a listener: the frames on the bus and the orders of the plant."""
+"""Ledgers of the observer: the frames on the bus and the orders of the plant."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -14,7 +14,7 @@ _WHO = (
 
 
 def who_of(number: int) -> int:
-    """Return the kind of sender of a message: a constant of `lcu.messages`."""
+    """Return who may send a message: a constant of `lcu.messages`."""
     for first, last, who in _WHO:
         if first <= number <= last:
             return who
@@ -59,13 +59,13 @@ class PlantCommand:
     Attributes
     ----------
     identity, name
-        Identity and name; a set of parameters has no command's name.
+        Identity and command name; a set of parameters is not a command and has its own name.
     addresses
-        Addresses of the heliostats that it is for.
+        Addresses of the heliostats that the command is for.
     at, until
-        When it was given and when it expires, s.
+        When the command was given and when it expires, s.
     authorised
-        Whether it carried the token of the authority.
+        Whether the command carried the token of the command authority.
     token
         The token.
     accepted
@@ -106,7 +106,7 @@ class FrameLedger:
         return len(self._order)
 
     def note(self, data: bytes, now: float) -> Sent | None:
-        """Keep a frame; return None if the bytes hold none."""
+        """Record a frame; return None if the bytes contain no frame."""
         known = self._frames.get(data)
         if known is not None:
             if known.who == messages.ANYONE:
@@ -134,11 +134,11 @@ class FrameLedger:
         return sent
 
     def of(self, data: bytes) -> Sent | None:
-        """Return the frame of some bytes, None if the cluster never sent it."""
+        """Return the recorded frame for some bytes; None if the cluster never sent them."""
         return self._frames.get(data)
 
     def data(self, index: int) -> bytes:
-        """Return the bytes of a frame by its index."""
+        """Return the bytes of the frame with an index."""
         return self._order[index]
 
 
@@ -153,11 +153,11 @@ class OrderLedger:
         self.by_identity: dict[str, PlantCommand] = {}
 
     def note(self, order: PlantCommand) -> None:
-        """Keep an order; a second one with the same identity is the same order, sent again."""
+        """Record an order; a second order with the same identity is a repetition and is ignored."""
         self.by_identity.setdefault(order.identity, order)
 
     def void(self, token: int, until: float) -> None:
-        """End the orders of a token: its authority is over."""
+        """End the orders that carry a token, because its authority has ended."""
         for order in self.by_identity.values():
             if order.token == token:
                 order.until = min(order.until, until)
@@ -169,7 +169,7 @@ class OrderLedger:
             del self.by_identity[identity]
 
     def covering(self, name: str, addresses: Iterable[int], now: float) -> list[PlantCommand]:
-        """Return the orders of a name for all these addresses that were given before now."""
+        """Return the orders with a name that were given before now and cover these addresses."""
         required = frozenset(addresses)
         return [
             order

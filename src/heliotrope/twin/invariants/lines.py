@@ -1,16 +1,16 @@
 """The observer of the line between the plant and a cluster: a lost line must be restored.
 
 A cluster that never reconnects is safe, but its heliostats are never used again. The observer knows
-from the faults of the run when nothing separates two running programs (invariant 16). They must
-then be connected within a time limit, and the plant's leases must arrive at their rate, whoever
-holds the command authority. The time limits are the observer's own.
+from the run's faults when both programs are running and nothing separates them. They must then be
+connected within a time limit (invariant 16), and the plant's leases must arrive at their rate,
+whoever holds the command authority. The time limits are the observer's own.
 """
 
 from heliotrope.twin.invariants.invariants import Judge
 
-#: A line on which nothing fails is connected within this, s.
+#: A line without a fault is connected within this, s.
 REJOINS_WITHIN = 20.0
-#: Greatest age of the last lease on a line that carries, s: the plant renews it every second.
+#: Maximum age of the last lease on a working line, s; the plant renews it every second.
 LEASE_EVERY = 3.0
 
 
@@ -22,7 +22,7 @@ class LineObserver(Judge):
     cluster
         Name of the cluster.
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
 
     """
 
@@ -32,7 +32,7 @@ class LineObserver(Judge):
         self._apart_since = self._whole_since = self._leased_at = start
 
     def on_lease(self, token: int, now: float) -> None:
-        """Note a lease that has left the plant."""
+        """Record a lease that has left the plant."""
         del token
         self._leased_at = now
 
@@ -42,11 +42,11 @@ class LineObserver(Judge):
         Parameters
         ----------
         now
-            s.
+            Time, s.
         clear
-            Whether both programs run, and no fault is between them.
+            Whether both programs are running, with no fault between them.
         connected
-            Whether both ends say that it is connected.
+            Whether both ends report that the line is connected.
         """
         if connected or not clear:
             self._apart_since = now

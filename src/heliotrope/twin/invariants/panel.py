@@ -1,4 +1,4 @@
-"""The observers of one plant, its program and its operators."""
+"""The observers of one plant, of its program and of its operators."""
 
 from dataclasses import dataclass
 
@@ -10,14 +10,15 @@ from heliotrope.twin.invariants.plant_observer import PlantObserver
 
 @dataclass(frozen=True)
 class Panel:
-    """The observers of one plant: some by name, for those who ask them or report to one alone.
+    """The observers of one plant, some of which can be addressed by name.
 
     Attributes
     ----------
     plant, beams, persons
-        Observers of its authority and records, of true beams, and of persons' orders and locks.
+        Observers of the plant's command authority and records, of true beams, and of operators'
+        orders and locks.
     others
-        Further observers, which hear of everything by their hooks alone.
+        Further observers, which receive events only through their hooks.
     """
 
     plant: PlantObserver

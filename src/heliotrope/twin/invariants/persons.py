@@ -1,14 +1,14 @@
-"""The observer of operators: what an operator has ordered or locked lasts until it is ended (17).
+"""The observer of operators: their orders and locks last until they are ended (invariant 17).
 
-It keeps its own ledger, from the calls that operators make and not from the plant: the emergencies
-that each operator ordered, with their actions, and withdrew; the heliostats that each operator
-locked, and the locks removed. While an order is active, the plant shows it under its owner's name,
-an emergency of at least that action is active, and no heliostat is up once it has had the time to
-turn away. A heliostat that an operator has locked remains at rest at stow until its last lock is
-removed, whatever is ordered, and nothing is written to it.
+The observer keeps its own ledger of the operators' calls, not of what the plant reports: the
+emergencies that each operator ordered, with their actions, and withdrew; the heliostats that each
+operator locked, and the locks removed. While an order is active, the plant shows it under its
+owner's name, an emergency of at least that action is active, and no heliostat is up once it has had
+the time to turn away. A heliostat that an operator has locked remains at rest at stow until its
+last lock is removed, whatever is ordered, and nothing is written to it.
 
-A board that restarts is exempt until it is at rest again, because no lock can prevent what it does
-at start-up; that is why anyone who works at a heliostat uses its switch.
+A board that restarts is exempt until it is at rest again, because no lock can prevent a motion at
+start-up. For that reason, anyone who works at a heliostat switches its drives off at the mirror.
 """
 
 from collections.abc import Sequence
@@ -21,22 +21,26 @@ from heliotrope.safety import Act
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.invariants.invariants import WORDS, Judge
 
-#: A new program goes on with what holds within this, and an order shows within this, s.
+#: Time within which a new program continues orders in force, and within which an order is shown, s.
 RECALLED_WITHIN, SHOWN_WITHIN = 2.0, 1.0
-#: No mirror is up this long after an order, s: 30 s, and the time between two judgements.
+#: No heliostat is up this long after an order, s: 30 s plus the time between two judgements.
 DOWN_WITHIN = 31.0
-#: A command that left before a lock is over by then, s: its life, and late on the bus.
+#: Time after which a command sent before a lock has ended, s: its lifetime plus delay on the bus.
 UNDER_WAY = 15.0
-#: A locked mirror moves if its motors turn by more than this, steps: drivers that rest let a
-#: coarse motor turn to its nearest full step.
+#: A locked heliostat counts as moving if its motors turn by more than this, steps: idle drivers let
+#: a coarse motor turn to its nearest full step.
 STANDS = 32
-#: States in which a mirror follows or seeks the sun.
+#: States in which a heliostat tracks, or is on its way to tracking.
 _UP = (states.APPROACHING, states.TRACKING, states.SEARCHING)
 
 
 @dataclass
 class _Lock:
-    """The locks on a heliostat: owners, since when; its place, and the program that counts it."""
+    """The locks on a heliostat.
+
+    The owners with the times of their locks, the motor positions at which the heliostat must stand
+    still, and the program (node) that was running then.
+    """
 
     owners: dict[str, float] = field(default_factory=dict)
     node: Node | None = None
@@ -45,28 +49,28 @@ class _Lock:
 
 @dataclass(frozen=True)
 class Words:
-    """What operators had ordered and locked at some time: orders by owner, owners of locks."""
+    """The operators' orders and locks at some time: orders by owner, and owners of locks."""
 
     orders: dict[str, tuple[Act, float]]
     locks: dict[str, tuple[str, ...]]
 
 
 class PersonsObserver(Judge):
-    """Observes what becomes of operators' orders and locks; see the module.
+    """Observes whether operators' orders and locks are kept; see the module.
 
     Parameters
     ----------
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
     boards
         All heliostats.
     alone
-        Whether no other plant commands the heliostats at times.
+        Whether this plant is the only one that ever commands the heliostats.
 
     Attributes
     ----------
     orders
-        Emergency orders that stand: act and time, s, by owner.
+        Emergency orders in force: action and time, s, by owner.
     """
 
     def __init__(self, start: float, boards: Sequence[Board], *, alone: bool = True) -> None:
@@ -81,12 +85,12 @@ class PersonsObserver(Judge):
     # -- what operators do -----------------------------------------------------------------------
 
     def on_call(self, owner: str, act: Act, now: float) -> None:
-        """Note an emergency order; an operator has one, of the stronger act."""
+        """Record an emergency order; an operator's stronger order replaces the weaker one."""
         before, at = self.orders.get(owner, (act, now))
         self.orders[owner] = max(act, before), at
 
     def withdrew(self, owner: str) -> None:
-        """Note that an operator's order is withdrawn, by that operator or by an engineer."""
+        """Record that an operator's order was withdrawn, by that operator or by an engineer."""
         self.orders.pop(owner, None)
 
     def withdrawal_refused(self, owner: str, reason: str, now: float) -> None:
@@ -96,19 +100,19 @@ class PersonsObserver(Judge):
         )
 
     def locked(self, owner: str, heliostats: Sequence[str], now: float) -> None:
-        """Note that an operator has locked heliostats."""
+        """Record that an operator has locked heliostats."""
         for name in heliostats:
             self._locks.setdefault(name, _Lock()).owners[owner] = now
 
     def on_write(self, heliostat: str, what: str, now: float) -> None:
-        """Check that nothing is written to a locked heliostat: its next STOW would move it."""
+        """Check that nothing is written to a locked heliostat, as its next STOW would move it."""
         lock = self._locks.get(heliostat)
         since = now - min(lock.owners.values()) if lock is not None else 0.0
         saw = f"{what} is sent to it {since:.1f} s after it was locked"
         self.check(WORDS, since <= UNDER_WAY, now, heliostat, saw)
 
     def returned(self, owner: str, heliostats: Sequence[str]) -> None:
-        """Note that an operator's locks are returned, by that operator or by an engineer."""
+        """Record that an operator's locks were removed, by that operator or by an engineer."""
         for name in heliostats:
             lock = self._locks.get(name, _Lock())
             lock.owners.pop(owner, None)
@@ -117,7 +121,7 @@ class PersonsObserver(Judge):
 
     @property
     def sure(self) -> bool:
-        """Whether the plant's store has the locks of now."""
+        """Whether the plant's store is certain to contain the present locks."""
         return self._confirmed
 
     @property
@@ -127,35 +131,36 @@ class PersonsObserver(Judge):
 
     @property
     def parked(self) -> tuple[str, ...]:
-        """Heliostats that are locked and stand still at stow, so that somebody may be at them."""
+        """Heliostats that are locked and at rest at stow, where someone may be working on them."""
         return tuple(name for name, lock in self._locks.items() if lock.place is not None)
 
     # -- the plant's store ---------------------------------------------------------------------
 
     def words(self) -> Words:
-        """Return the orders and locks in force, as a backup of the plant's store holds them now."""
+        """Return the orders and locks that a backup of the plant's store would now contain."""
         return Words(dict(self.orders), self.locks)
 
     def restored(self, words: Words, now: float) -> None:
-        """Note that the plant's store is a backup: it has the orders of that time.
+        """Record that the plant's store was restored from a backup, with the orders of that time.
 
-        The locks of now go on, until operators have confirmed what the store has (`confirmed`).
+        The present locks stay in force. Until operators have confirmed the contents of the store
+        (`confirmed`), the store is not compared with them.
         """
         self.orders = {owner: (act, now) for owner, (act, _) in words.orders.items()}
         self._confirmed = False
 
     def confirmed(self) -> None:
-        """Note that operators have put their locks again, and returned old ones."""
+        """Record that operators have applied their locks again and removed old ones."""
         self._confirmed = True
 
     def forget(self) -> None:
-        """Forget all: the plant had no store, and has ended."""
+        """Forget all orders and locks, because the plant had no store and has ended."""
         self.orders, self._locks = {}, {}
 
     # -- judgement -----------------------------------------------------------------------------
 
     def look(self, plant: PlantController | None, now: float) -> None:
-        """Judge orders and locks; None: the plant's program does not run."""
+        """Judge orders and locks; ``plant`` is None if the plant program is not running."""
         if plant is not self._plant:
             self._plant, self._since = plant, now
         if plant is not None and now - self._since > RECALLED_WITHIN:
@@ -168,7 +173,7 @@ class PersonsObserver(Judge):
             self._still(name, lock, now)
 
     def _stands(self, plant: PlantController, now: float) -> None:
-        """Check that each order stands under its owner's name, and that no other does."""
+        """Check that each order is in force under its owner's name, and that no other order is."""
         shown = {call.who for call in plant.sentinel.calls}
         for owner, (act, at) in self.orders.items():
             if now - at <= SHOWN_WITHIN:
@@ -184,7 +189,7 @@ class PersonsObserver(Judge):
             self.check(WORDS, owner in self.orders, now, "plant", saw)
 
     def _shown(self, plant: PlantController, now: float) -> None:
-        """Check that the plant has the locks of each operator, and no others."""
+        """Check that the plant has exactly the locks that operators have applied."""
         present = {(lock.name, lock.who) for lock in plant.lockouts}
         required = {(name, owner) for name, lock in self._locks.items() for owner in lock.owners}
         for name, owner in sorted(required ^ present):
@@ -193,7 +198,7 @@ class PersonsObserver(Judge):
         self.check(WORDS, True, now, "plant", "")
 
     def _down(self, now: float) -> None:
-        """Check that no mirror is up while somebody's order stands."""
+        """Check that no heliostat is up while an operator's emergency order is in force."""
         if not self.orders:
             return
         owner, (act, at) = min(self.orders.items(), key=lambda order: order[1][1])

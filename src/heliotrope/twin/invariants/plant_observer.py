@@ -1,10 +1,10 @@
-"""The observer of the plant: what it accepts, records, shows and lets join, in true time.
+"""The observer of the plant: its command authority, its records, its displayed values, and joining.
 
 It works alongside one `twin.invariants.Observer` per cluster and, like them, trusts no report: it
-knows the holder of the authority from those who took it, the records from the disk, the age of a
-value from when the bus carried it, and the joining heliostats from the messages and the boards. It
-checks the plant's part of three invariants: 4 (authority), 10 (joining) and 11 (records, values and
-proofs).
+knows the holder of the command authority from the operators who took it, the records from the disk,
+a value's age from when the bus carried it, and the joining heliostats from the messages and the
+boards, all in true time. It checks the plant's part of three invariants: 4 (authority), 10
+(joining) and 11 (records, values and confirmations).
 """
 
 from collections import Counter, deque
@@ -22,26 +22,27 @@ from heliotrope.safety import Act
 from heliotrope.twin.invariants.invariants import Judge, Observer
 from heliotrope.twin.records import RecordsDisk
 
-#: A status waits up to a second, may be in transit for another, and ages are rounded: a value may
-#: be shown this much younger than it is, s.
+#: A value may be shown as this much younger than it is, s: a status waits up to a second, may be in
+#: transit for another second, and ages are rounded.
 YOUNGER = 2.2
-#: A record that may follow its command is there within this, s; the plant's own order waits for
-#: its turn no longer than this, s: with a mirror every two seconds the field has joined before.
+#: A record that may follow its command is stored within the first time, s. The plant's own order
+#: waits for its turn no longer than the second time, s: the field joins sooner, even at one
+#: heliostat every two seconds.
 RECORD_WITHIN, TURN_WITHIN = 2.0, 60.0
-#: An order to turn away that is repeated within this is the same one, s.
+#: An order to turn away that is repeated within this time is the same order, s.
 MOMENT = 0.3
-#: How long a cluster may accept a void token: until the last lease with it has arrived and has
-#: expired, s.
+#: Time for which a cluster may accept a void token: until the last lease with that token has
+#: arrived and expired, s.
 VOID_WITHIN = 4.2
-#: Leases that go to different clusters within this time are of one moment, s.
+#: Leases sent to different clusters within this time count as simultaneous, s.
 _AT_ONCE = 0.5
-#: What a refusal says for one reason and for no other.
+#: Words that a refusal contains for one reason and for no other.
 ROLE_REASON, NOBODY_REASON = "but the command needs ", "nobody has it"
 OTHER_REASON = "was not sent; take command first"
 #: Longest time from posting a command to join to its execution, beyond its lifetime: in transit and
 #: late on the bus; and the interval between looks at the boards, s.
 LATE, LOOKS = 1.8, 0.5
-#: States that a proof may call done.
+#: States in which a heliostat may be confirmed as done.
 _OFF = (
     states.DEFOCUSED,
     states.STOWING,
@@ -53,14 +54,14 @@ _OFF = (
 _OWN = ("plant", "safety table")
 #: Ends of the names under which automatic control commands.
 _UNTOLD = (AUTOMATIC.name, "out of service")
-#: Commands that an operator may give, and those that bring beams to the receiver: tables of the
-#: observer's own, so that an error in the plant's is found.
+#: Commands that an operator may give, and commands that bring beams to the receiver. These are the
+#: observer's own tables, so that an error in the plant's tables is found.
 _OPERATORS = (
     "APPROACH", "IDLE", "TRACK", "REFOCUS", "LOCK", "UNLOCK", "AIM", "STANDBY", "LOCK_AIM",
     "SEARCH",
 )  # fmt: skip
 _JOINING = ("TRACK", "REFOCUS", "SEARCH")
-#: Commands that move a heliostat or hold it, and those that leave it to whoever has it.
+#: Commands that move or hold a heliostat, and commands after which its owner keeps it.
 _MOTIONS = ("APPROACH", "IDLE", "LOCK", *_JOINING)
 _SETTINGS = ("LOCK_AIM", "ROUGH")
 
@@ -84,7 +85,7 @@ class PlantObserver(Judge):
     Attributes
     ----------
     old
-        Invalid tokens, and since when, s.
+        Invalid tokens, each with the time since which it has been invalid, s.
     """
 
     def __init__(
@@ -134,7 +135,7 @@ class PlantObserver(Judge):
     # -- authority -------------------------------------------------------------------------
 
     def _live(self, now: float) -> tuple[Person, int, float] | None:
-        """Return the holder of the authority; an authority that nobody renews is over."""
+        """Return the holder of the command authority; authority that is not renewed ends."""
         holder = self._holder
         if holder is not None:
             over = max(holder[2], self._perhaps) + self._settings.authority
@@ -154,7 +155,7 @@ class PlantObserver(Judge):
             cluster.orders.void(token, now + VOID_WITHIN)
 
     def granted(self, person: Person, token: int, now: float, *, seized: bool) -> None:
-        """Check a grant of the authority."""
+        """Check that the command authority was granted correctly."""
         before = self._live(now)
         saw = f"{person.name} ({person.role.name.lower()}) was given the authority"
         good = person.role >= Role.OPERATOR
@@ -171,19 +172,20 @@ class PlantObserver(Judge):
         self._from_nobody = before is None
 
     def kept(self, now: float) -> None:
-        """Note that the holder has renewed it."""
+        """Record that the holder has renewed the authority."""
         if self._holder is not None:
             self._holder = (*self._holder[:2], now)
 
     def released(self, person: Person, now: float) -> None:
-        """Note that it was released."""
+        """Record that the holder has released the authority."""
         self._noted(person.name, "AUTHORITY", now)
         self._end(now)
 
     def gave_way(self, now: float, token: int = 0) -> None:
-        """Note that automatic control yields its authority to an operator.
+        """Record that automatic control yields its authority to an operator.
 
-        ``token``: its token, 0 if none. The first lease with that token may leave only after this.
+        ``token`` is automatic control's token, 0 if it had none. A first lease with that token may
+        still leave the plant only after this call.
         """
         if self._by_itself():
             self._end(now)
@@ -196,8 +198,9 @@ class PlantObserver(Judge):
     def _leased(self, token: int, now: float) -> None:
         """Follow the authority of automatic control, which no operator reports.
 
-        It may only have what nobody holds. Leases of one moment to several clusters may be from
-        before a grant and after it, and arrive here in any order.
+        Automatic control may take the authority only if nobody holds it. Leases sent to several
+        clusters at the same moment may stem from before or after a grant, and arrive here in any
+        order.
         """
         holder = self._live(now)
         if holder is not None and holder[1] == token:
@@ -221,7 +224,7 @@ class PlantObserver(Judge):
         return self._by_itself()
 
     def holder(self, now: float) -> str | None:
-        """Return the operator certain to hold the authority; None: it is not certain.
+        """Return the operator who certainly holds the command authority; None if that is uncertain.
 
         Automatic control releases it without notice.
         """
@@ -232,12 +235,12 @@ class PlantObserver(Judge):
         return holder[0].name if sure else None
 
     def until(self, token: int, until: float) -> float:
-        """Return when an order with a token becomes invalid."""
+        """Return the time at which an order that carries a token becomes invalid."""
         void = self.old.get(token)
         return until if void is None else min(until, void + VOID_WITHIN)
 
     def known(self, token: int) -> bool:
-        """Whether a token was ever issued."""
+        """Return whether a token was ever issued."""
         return token in self.old or (self._holder is not None and self._holder[1] == token)
 
     # -- accepted commands -----------------------------------------------------------------
@@ -270,8 +273,8 @@ class PlantObserver(Judge):
     ) -> None:
         """Check the reason of a refusal, if it names the command authority or the role.
 
-        A command that its holder may give is refused for other reasons after it has renewed the
-        authority, or before.
+        If the holder's own command is refused for another reason, the command may or may not have
+        renewed the authority.
         """
         holder, what = self._live(now), asked[0]
         # An authority that nobody has renewed for a while may be over a moment earlier or later.
@@ -297,15 +300,15 @@ class PlantObserver(Judge):
         self.check(11, right, now, "plant", f"{what} by {who} was accepted without its record")
 
     def on_safe(self, person: Person, ticket: Ticket, what: str, now: float) -> None:
-        """Note a DEFOCUS or STOW, which the plant must accept from anyone."""
+        """Record a DEFOCUS or STOW, which the plant must accept from anyone."""
         self.obeyed(person.name, what, now, ticket.identity)
 
     def on_call(self, owner: str, act: Act, now: float) -> None:
-        """Note an emergency, which the plant must accept from anyone."""
+        """Record an emergency, which the plant must accept from anyone."""
         self.obeyed(owner, act.name, now)
 
     def obeyed(self, who: str, what: str, now: float, identity: str = "") -> None:
-        """Note a command that the plant must accept from anyone, and may record later.
+        """Record a command that the plant must accept from anyone, and may record later.
 
         A repetition within a moment is the same command, with the same identity.
         """
@@ -319,7 +322,7 @@ class PlantObserver(Judge):
         self._noted_at[who, what] = now
 
     def on_end(self, now: float) -> None:
-        """Note that the plant program has ended; records not yet written are lost."""
+        """Record that the plant program has ended; records not yet written are lost."""
         self._end(now)
         self._count(now)
         self._accepted = Counter(self._recorded)
@@ -329,9 +332,9 @@ class PlantObserver(Judge):
         self._hangs = self._stands = False
 
     def hangs(self, now: float, *, on: bool, stands: bool) -> None:
-        """Note that the plant's messages are held up, and may later be sent together; or flow.
+        """Record whether the plant's messages are held up, and may later be sent together.
 
-        ``stands``: the whole program is frozen.
+        If ``stands``, the whole program is frozen.
         """
         if on or self._hangs:
             self._hung_at = now
@@ -374,8 +377,8 @@ class PlantObserver(Judge):
     def _spares_taken(self, what: str, heliostats: Sequence[str], now: float) -> None:
         """Check that automatic control moves no heliostat that the holder has commanded.
 
-        Its visits go on beside an operator's command, with the other heliostats. What was on its
-        way when the operator commanded may still leave.
+        Calibration visits continue with the other heliostats while an operator commands. Messages
+        that were already on their way when the operator gave the command may still leave.
         """
         holder = self._live(now)
         if holder is None or holder[0] == AUTOMATIC:
@@ -386,16 +389,16 @@ class PlantObserver(Judge):
             self.check(4, passed <= _AT_ONCE, now, "plant", f"{saw} ago")
 
     def aimed(self, name: str) -> float:
-        """Return when an aim was last sent to a heliostat, s; -inf if never."""
+        """Return when an aim was last sent to a heliostat, s; -inf if none was ever sent."""
         return self._aimed.get(name, float("-inf"))
 
     def _bounded(
         self, joined: "deque[tuple[float, int]]", slack: float, now: float, how: str
     ) -> None:
-        """Check that no more mirrors join in any span that ends now than the settings allow.
+        """Check that in every period ending now, no more heliostats join than are allowed.
 
-        Commands that leave when the plant goes on after a freeze may have been admitted earlier by
-        the lifetime of a command, both at the end of a span and at its beginning.
+        Commands that leave when the plant resumes after a freeze may have been admitted earlier, by
+        up to a command's lifetime. This applies both to the beginning and to the end of a period.
         """
         rate, burst = self._settings.join_rate, self._settings.join_burst
         life = self._settings.join_life
@@ -413,23 +416,23 @@ class PlantObserver(Judge):
     # -- displayed values ------------------------------------------------------------------
 
     def heard(self, name: str, state: int, now: float) -> None:
-        """Note a heliostat's report to its cluster."""
+        """Record a heliostat's report to its cluster."""
         self._heard[name].append((now, state))
 
     def reports(self, name: str, since: float) -> set[int]:
-        """Return the states that a heliostat has reported to its cluster since a time, s."""
+        """Return the states that a heliostat has reported to its cluster since a time in s."""
         return {state for at, state in self._heard[name] if at >= since}
 
     def counted(self, name: str, steps: tuple[int, int], now: float) -> None:
-        """Note the true step counts of a heliostat that replies to its cluster."""
+        """Record the true step counts of a heliostat when it replies to its cluster."""
         self._true_counts[name].append((now, steps))
 
     def true_counts(self, name: str, since: float) -> list[tuple[int, int]]:
-        """Return the true step counts with which a heliostat has replied since a time, s."""
+        """Return the true step counts at a heliostat's replies since a time in s."""
         return [steps for at, steps in self._true_counts[name] if at >= since]
 
     def look(self, plant: PlantController | None, now: float) -> None:
-        """Check everything that must have happened by now; None: the plant is not running."""
+        """Check all that must have happened by now; ``plant`` is None if it is not running."""
         self.hangs(now, on=self._hangs, stands=self._stands)
         if self._by_itself() and plant is not None:
             grant, held = plant.authority.grant, self._holder
@@ -442,9 +445,9 @@ class PlantObserver(Judge):
             return
         if plant.authority.visited():
             self._visited_at = now
-        # A beam that goes back to its aim on the receiver waits for its turn to join.
+        # A heliostat that returns its beam to the receiver waits for its turn to join.
         waits = {ticket.identity for ticket in plant.orders if not ticket.sent}
-        # That it does is the plant's word, and believed for as long as turns may take.
+        # The plant says that it waits, and is believed for as long as turns may take.
         for identity in self._own.keys() & waits:
             since = self._own[identity][0]
             saw = f"record {identity} has waited for its turn for {now - since:.0f} s"
@@ -457,7 +460,7 @@ class PlantObserver(Judge):
         self._proofs(plant, now)
 
     def _count(self, now: float) -> None:
-        """Check that each record belongs to one command, and that no command has two."""
+        """Check that each record belongs to a command, and that no command has two records."""
         records = self._disk.records
         for record in islice(records.values(), self._counted_records, None):
             if record.who.endswith(_UNTOLD):
@@ -496,13 +499,13 @@ class PlantObserver(Judge):
         for identity, (_, at) in list(self._own.items()):
             if now - max(at, self._hung_at) > RECORD_WITHIN:
                 del self._own[identity]
-                # A command that waited too long for the disk is given up; its record says so.
+                # A command that waited too long for the disk is not sent; its record says so.
                 given_up = "not sent" in self._disk.records[identity].result
                 saw = f"record {identity} belongs to nothing that was sent, and does not say so"
                 self.check(11, given_up, now, "plant", saw)
 
     def _boards(self, now: float) -> None:
-        """Note the mirrors that join, by the boards themselves."""
+        """Record the heliostats that join, according to the boards themselves."""
         on = {
             name
             for name, account in self._accounts.items()
@@ -533,7 +536,7 @@ class PlantObserver(Judge):
             self.check(11, shown.state in reported, now, "plant", saw)
 
     def _proofs(self, plant: PlantController, now: float) -> None:
-        """Check that everything a proof calls done was done."""
+        """Check that every heliostat confirmed as done has carried out its emergency order."""
         order = plant.sentinel.order
         if order is None:
             return

@@ -1,15 +1,15 @@
-"""The observer of progress: automatic control raises and calibrates the field, in time.
+"""The observer of progress: automatic control raises and calibrates the field in time.
 
-The operators report to it what they have put under automatic control, and who holds the command
-authority. In an undisturbed period (`quiet`) a heliostat under automatic control must leave stow,
-and be measured when a target is free; a visit must end, and leave no beam on its target; no part of
-the work may fail; and measurements must continue while some heliostats are not calibrated (16). A
-heliostat that stays at stow because volumes obstruct its path must be named. Whatever a visit has
-taken is released: no heliostat stays LOCKED without a visit, an operator or an emergency that holds
-it (L1). A heliostat under automatic control tracks the receiver, or is in a visit, within a time
-limit (L3). An emergency, and the list of heliostats out of service, survive a restart (L4). Taking
-the command authority ends no visit, and a heliostat that is being photographed uses fine steps,
-whatever an operator sets (16). All time limits are the observer's own.
+The operators tell the observer which heliostats they have put under automatic control, and who
+holds the command authority. In an undisturbed period (`quiet`) a heliostat under automatic control
+must leave stow, and be measured when a target is free; a visit must end, and leave no beam on its
+target; no part of the work may fail; and measurements must continue while some heliostats are not
+calibrated (16). A heliostat that stays at stow because volumes obstruct its path must be named.
+Whatever a visit has taken is released: no heliostat stays LOCKED without a visit, an operator or an
+emergency that holds it (L1). A heliostat under automatic control tracks the receiver, or is in a
+visit, within a time limit (L3). An emergency, and the list of heliostats out of service, survive a
+restart (L4). Taking the command authority ends no visit, and a heliostat that is being photographed
+uses fine steps, whatever an operator sets (16). All time limits are the observer's own.
 """
 
 from collections import Counter
@@ -30,28 +30,30 @@ from heliotrope.twin.invariants.invariants import L1, L3, L4, OFF, Judge
 #: The field belongs up once the sun is this much higher than the elevation below which it belongs
 #: at stow, rad, or if it was never below it.
 HIGHER = radians(1.1)
-#: A heliostat that was given leaves stow within this: losses rest for 30 s; s.
+#: A heliostat under automatic control leaves stow within this time, s; after a loss, automatic
+#: control waits for 30 s.
 RAISED_WITHIN = 60.0
-#: A target is idle this long at most while a heliostat is ready for it; the same where heliostats
-#: wait for each other, s.
+#: Longest time for which a target may be idle while a heliostat is ready for it, s; and the same if
+#: heliostats wait for one another.
 IDLE_WITHIN, TOGETHER_WITHIN = 25.0, 110.0
-#: A visit ends within this, s.
+#: A visit ends within this time, s.
 VISIT_WITHIN = 260.0
 #: A beam may stay on a target without a visit for this long, wherever an operator has sent it, s.
 LEFT_WITHIN = 30.0
-#: A mirror is LOCKED without an owner for this long at most, s: parameters take seconds.
+#: Longest time for which a heliostat may be LOCKED without an owner, s; writing parameters takes
+#: seconds.
 LOCKED_WITHIN = 60.0
-#: One that automatic control has tracks within this, s: ten minutes are allowed, and a few mirrors
-#: that leave stow one each second need three. While some are not calibrated, a measurement comes
-#: within this, s.
+#: A heliostat under automatic control tracks within the first time, s: ten minutes are allowed, and
+#: a few heliostats that leave stow one per second need three. While some are not calibrated, a
+#: measurement is made within the second time, s.
 TRACKS_WITHIN, MEASURED_WITHIN = 240.0, 300.0
-#: A visit goes on after an operator has taken the command authority: it does not break off within
-#: this, s.
+#: After an operator has taken the command authority, a visit must not be broken off within this
+#: time, s.
 GOES_ON = 3.0
-#: Names of the alarms that a part of the work has failed, that a way from stow is not free, and
-#: that nobody had the command authority for a while.
+#: Names of the alarms which say that a part of the work has failed, that a path from stow is
+#: obstructed, and that nobody held the command authority for a while.
 FAILED, BLOCKED, NOBODY = "work", "beam_blocked", "authority_lost"
-#: What the stages of visits with photographs have in them.
+#: Word in the names of the visit stages in which photographs are taken.
 PHOTOGRAPH = "photograph "
 
 
@@ -67,13 +69,13 @@ class ProgressObserver(Judge):
     targets
         Calibration targets.
     together
-        Whether heliostats wait for each other, to be measured together.
+        Whether heliostats wait for one another in order to be measured together.
     across
         Whether keep-out volumes may obstruct the paths from stow.
     lowest
         Sun elevation below which the field belongs at stow, rad.
     dark
-        Heliostats whose beams no camera sees, because the plant file is wrong about them, so that
+        Heliostats whose beams no camera sees, because the plant file is so wrong about them that
         their beams miss the receiver and the targets, or because the mirror is covered.
 
     """
@@ -106,37 +108,40 @@ class ProgressObserver(Judge):
     # -- operators -----------------------------------------------------------------------------
 
     def given(self, heliostats: Sequence[str]) -> None:
-        """Note that an operator has put heliostats under automatic control."""
+        """Record that an operator has put heliostats under automatic control."""
         self._assigned.update(heliostats)
 
     def taken(self, heliostats: Sequence[str]) -> None:
-        """Note that an operator has moved heliostats, and may do so until they are given back."""
+        """Record that an operator has moved heliostats.
+
+        The operator may move them until they are given back to automatic control.
+        """
         self._assigned.difference_update(heliostats)
 
     def commanded(self, what: str, heliostats: Sequence[str]) -> None:
-        """Note an operator command that the plant has accepted: a lock has its owner."""
+        """Record an operator command that the plant has accepted; a LOCK then has an owner."""
         if what == "LOCK":
             self._locked.update(heliostats)
         elif what == "UNLOCK":
             self._locked.difference_update(heliostats)
 
     def took(self, operations: Operations, now: float) -> None:
-        """Note that an operator has taken the command authority."""
+        """Record that an operator has taken the command authority."""
         running = operations.automatic.view().running
         self._took_at = now
         here = (run for run in running if run.target in self._targets)
         self._begun = {run.target: set(run.heliostats) for run in here}
 
     def switched(self, *, on: bool) -> None:
-        """Note that an operator has switched calibration on or off."""
+        """Record that an operator has switched calibration on or off."""
         self._calibrates = on
 
     def emergency(self, *, on: bool) -> None:
-        """Note that an operator has ordered an emergency, or that it was cleared."""
+        """Record that an operator has called an emergency, or that it was cleared."""
         self._called = on
 
     def on_end(self, now: float) -> None:
-        """Note that the plant program has ended."""
+        """Record that the plant program has ended."""
         del now
         self._ended, self._calibrates = True, True
         self._since.clear()
@@ -144,7 +149,7 @@ class ProgressObserver(Judge):
         self._begun.clear()
 
     def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
-        """Note that an operator has taken heliostats out of service, or put them back."""
+        """Record that an operator has taken heliostats out of service, or put them back."""
         for name in heliostats:
             if out:
                 self._out.setdefault(name, now)
@@ -167,7 +172,7 @@ class ProgressObserver(Judge):
         Parameters
         ----------
         operations
-            The plant; None: its program is not running, or is frozen.
+            The plant's operations; None if its program is not running, or is frozen.
         quiet
             Heliostats in an undisturbed period.
         sun
@@ -239,7 +244,7 @@ class ProgressObserver(Judge):
         self._measures(operations, working, may=may, now=now)
 
     def _high(self, sun: FloatArray) -> bool:
-        """Return whether the field belongs up: it was raised, and the sun has not fallen since."""
+        """Return whether the field should be up: the sun was high enough, and has not set since."""
         above = asin(float(sun[2])) - self._lowest
         if self._up is None or above < 0.0:
             self._up = above > 0.0
@@ -247,7 +252,7 @@ class ProgressObserver(Judge):
         return self._up
 
     def _owned(self, visited: Set[str], quiet: Set[str], now: float) -> None:
-        """Check that no mirror is LOCKED without an owner, where nothing has failed."""
+        """Check that no heliostat is LOCKED without an owner while nothing has failed."""
         for name, board in self._boards.items():
             locked = board.state == states.LOCKED and name in quiet and not self._emergency
             locked &= name not in visited | self._locked and name not in self._out
@@ -255,7 +260,7 @@ class ProgressObserver(Judge):
             self._within(("locked", name), locked, now, LOCKED_WITHIN, name, saw, L1)
 
     def _recalled(self, operations: Operations, now: float) -> None:
-        """Check that a new program goes on with what held when the last one ended."""
+        """Check that a new program continues the emergency and the locks that were in force."""
         on = operations.plant.sentinel.on
         if self._ended:
             self._ended = False
@@ -269,7 +274,7 @@ class ProgressObserver(Judge):
         self._emergency = on
 
     def _go_on(self, operations: Operations, untouched: Set[str], now: float) -> None:
-        """Check that no visit of untouched mirrors breaks off when an operator takes command."""
+        """Check that an operator's taking command ends no visit of heliostats left untouched."""
         view = operations.automatic.view()
         if now - self._took_at > GOES_ON:
             self._begun.clear()
@@ -286,7 +291,7 @@ class ProgressObserver(Judge):
     def _step_finely(
         self, running: Sequence[Running], quiet: Set[str], sun: FloatArray, now: float
     ) -> None:
-        """Check that the mirrors whose beams are photographed on a target step finely."""
+        """Check that heliostats whose beams are photographed on a target use fine steps."""
         for run in running:
             target = self._targets.get(run.target)
             if target is None or PHOTOGRAPH not in run.stage:
@@ -301,7 +306,7 @@ class ProgressObserver(Judge):
     def _measures(
         self, operations: Operations, working: Sequence[str], *, may: bool, now: float
     ) -> None:
-        """Check that measurements come while some mirrors have not been visited yet."""
+        """Check that measurements continue while some heliostats are not calibrated."""
         beliefs = operations.plant.beliefs
         results = operations.automatic.view().results
         done = {result.heliostat for result in results} | self._dark
@@ -322,7 +327,7 @@ class ProgressObserver(Judge):
         what: str,
         number: int = 16,
     ) -> None:
-        """Check that something does not hold for longer than a time."""
+        """Check that a condition does not hold for longer than a time limit."""
         if not holds:
             self._since.pop(key, None)
             return
@@ -331,12 +336,12 @@ class ProgressObserver(Judge):
         self.check(number, passed <= limit, now, name, saw)
 
     def _on(self, board: Board, target: Target, sun: FloatArray) -> bool:
-        """Whether a beam is within a target, by the steps that were made."""
+        """Return whether a beam is on a target, according to the steps made."""
         x, y, z = (float(coordinate) for coordinate in target.center)
         return board.miss(sun, (x, y, z), believed=True) < 0.5 * min(target.width, target.height)
 
     def _visits(self, running: Sequence[Running], now: float) -> None:
-        """Check the visits that are shown as under way."""
+        """Check the visits that are shown as in progress."""
         counted = Counter(name for run in running for name in run.heliostats)
         for name, count in counted.items():
             self.check(16, count == 1, now, name, f"it is shown in {count} visits at once")

@@ -1,11 +1,11 @@
-"""The observer of work: in an undisturbed period, what was ordered is done.
+"""The observer of work: in an undisturbed period, orders must be carried out.
 
 A field that does less than ordered, or does it later, violates no safety invariant. If nothing has
 failed near a heliostat for a while, and no alarm names it, this observer expects that SUN and
-STATUS arrive at their rates, that an order sent by the plant leads to the requested state, that the
-beam is at its point to within the step size, that no heliostat stops working by itself, and that
-the plant is informed (invariant 16). It knows the orders from the line, the boards, and the faults
-of the run; its time limits are its own.
+STATUS arrive at their rates, that an order sent by the plant results in the requested state, that
+the beam is at its point to within the step size, that no heliostat stops working by itself, and
+that the plant is informed (invariant 16). It knows the orders from the line, the boards, and the
+faults of the run; its time limits are its own.
 """
 
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -27,35 +27,36 @@ from heliotrope.twin.invariants._account import HeliostatAccount
 from heliotrope.twin.invariants.beams import slew
 from heliotrope.twin.invariants.invariants import OFF, Judge, Observer
 
-#: A stretch is quiet this long after the last fault, a board's boot, and the end of the last alarm
-#: that names a heliostat or its cluster, s.
+#: An undisturbed period begins this long after the last fault, a board's boot, and the end of the
+#: last alarm that names a heliostat or its cluster, s.
 SETTLED = 15.0
-#: Greatest age of the last SUN that has reached a board, and of the last STATUS of it that has
-#: reached the cluster, s: both are sent every second.
+#: Maximum age of the last SUN that has reached a board, and of the board's last STATUS that has
+#: reached the cluster, s. Both are sent every second.
 SUN_EVERY, STATUS_EVERY = 3.0, 5.0
-#: Time from an order that the plant sends to the state that it asks for, s; for APPROACH and STOW
-#: the slew of both axes, one after the other, at 8000 steps/s: a turn takes 50 s. A way from the
-#: ground that crosses the keyhole, where the stops forbid the short turn, makes nearly two.
+#: Time from an order that the plant sends to the state that it requests, s; for APPROACH and STOW
+#: the slew of both axes, one after the other, at 8000 steps/s: a turn takes 50 s. A path from the
+#: ground that crosses the keyhole, where the stops forbid the short turn, makes nearly two turns.
 SOON, APPROACH_WITHIN, STOW_WITHIN = 5.0, 150.0, 120.0
-#: From the state to the plant's knowledge of it, and to the proof of an emergency, s.
+#: Time from the state to the plant's knowledge of it, and to the confirmation of an emergency, s.
 TOLD_WITHIN, PROVEN_WITHIN = 8.0, 20.0
 #: Time for a beam to come to its point after an order or a change of state, s; if it is not there
 #: by then, its drives have the time that they need from there, see `beams.slew`.
 ON_POINT_WITHIN = 12.0
-#: A beam is this near its point, by the steps made: share of its length, rad, and m. Rough stepping
-#: is 0.25 mrad of the mirror, pushed biases 0.1 mrad; beams turn by twice as much.
+#: Largest distance of a beam from its point, according to the steps made: a fraction of the beam's
+#: length, rad, plus a distance, m. Coarse steps turn the mirror by 0.25 mrad, and pushed biases by
+#: 0.1 mrad; beams turn by twice as much.
 NEAR, NEAR_M = 1.2e-3, 0.05
-#: An authority counts once the clusters have it, and orders given one after another cross, s.
+#: Time until the clusters know a new authority; and time within which two orders may cross, s.
 GRANTED, CROSSING = 4.0, 3.0
 
-#: What a refusal says of a heliostat, and for how long a quiet stretch may have lasted by then, s:
-#: statuses come every second, what is stored is asked for again after 30 s.
+#: Reasons in a refusal, and how long an undisturbed period may have lasted by then, s: statuses
+#: arrive every second, and stored items are requested again after 30 s.
 UNHEARD_REASON, UNHEARD_FOR = "it has sent nothing since", 0.0
 UNCOMPARED_REASON, UNCOMPARED_FOR = "not been compared with the wanted", 45.0
-#: A refusal by step counts that are right.
+#: Reason of a refusal because of doubtful step counts, which is wrong if the counts are right.
 DOUBT_REASON = "step counts may be wrong"
 
-#: States from which each order must be carried out, and those that it asks for.
+#: States from which each order must be carried out, and the states that it requests.
 ORDERS = {
     "APPROACH": ((states.STOWED,), (states.IDLE,), APPROACH_WITHIN),
     "TRACK": ((states.IDLE, states.DEFOCUSED, states.SEARCHING), (states.TRACKING,), SOON),
@@ -66,7 +67,7 @@ ORDERS = {
     ),
     "SEARCH": ((states.IDLE, states.TRACKING), (states.SEARCHING,), SOON),
 }  # fmt: skip
-#: The same for orders that anybody may give.
+#: The same for orders that anyone may give.
 SAFE_ORDERS = {
     "DEFOCUS": (
         (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING),
@@ -79,21 +80,21 @@ SAFE_ORDERS = {
         STOW_WITHIN,
     ),
 }
-#: Orders that need the way from stow, and those that change neither state nor motion.
+#: Orders that require the path from stow, and orders that change neither state nor motion.
 _BY_WAY = ("TRACK", "REFOCUS", "SEARCH")
 _ASIDE = ("AIM", "STANDBY", "ROUGH", "LOCK_AIM")
-#: Orders after which a mirror that is IDLE does not stand at its standby point.
+#: Orders after which an IDLE heliostat is not at its standby point.
 _ELSEWHERE = ("JOG", "GOTO", "DIAGNOSE", "UNLOCK", "CLEAR_FAULT", "LOCK", "ZERO")
-#: States in which a mirror works until it is told otherwise, and those that it must not fall into.
+#: States in which a heliostat works until ordered otherwise, and states that it must not fall into.
 _WORKS = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)
 _FALLS = (states.DEFOCUSED, states.STOWING, states.STOWED, states.FAULT)
-#: Items of a board that must be the mirror's own, if its work is to be judged.
+#: Items of a board that must be the heliostat's own if its work is to be judged.
 _OWN = ("location", "armature", "drives", "limits_primary", "limits_secondary")
 
 
 @dataclass
 class _Order:
-    """An order that must be carried out: where it leads, by when, and whether it has been seen."""
+    """An order that must be carried out: its final states, its time limit, and when it was done."""
 
     identity: str
     name: str
@@ -105,7 +106,7 @@ class _Order:
 
 @dataclass
 class _Mirror:
-    """One mirror: its account, its expected state, and when it last changed."""
+    """One heliostat: the observer's record of it, its expected state, and when it last changed."""
 
     account: HeliostatAccount
     cluster: str
@@ -132,20 +133,20 @@ class _Mirror:
 
 
 class QuietObserver(Judge):
-    """Observes what is done in quiet stretches; see the module.
+    """Observes the work in undisturbed periods; see the module.
 
     Parameters
     ----------
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
     clusters
         Observers of the clusters, by name.
     sun
-        Returns the true direction to the sun, (3,), at a time in s.
+        Function that returns the true direction to the sun, (3,), at a time in s.
     reaches
-        Whether every mirror reaches its points at every hour of the run.
+        Whether every heliostat can reach its points throughout the run.
     near
-        A beam is this near its point, as a share of its length, rad.
+        Largest distance of a beam from its point, as a fraction of the beam's length, rad.
 
     """
 
@@ -182,22 +183,22 @@ class QuietObserver(Judge):
 
     @property
     def stretches(self) -> frozenset[str]:
-        """Heliostats that are in a quiet stretch."""
+        """Heliostats that are in an undisturbed period."""
         return self._quiet
 
     def calm(self) -> frozenset[str]:
-        """Return `stretches`."""
+        """Return the heliostats that are in an undisturbed period."""
         return self._quiet
 
     # -- orders and reports ------------------------------------------------------------------
 
     def on_lease(self, token: int, now: float) -> None:
-        """Note a lease that has left the plant."""
+        """Record a lease that has left the plant."""
         if token != self._token:
             self._token, self._token_at = token, now
 
     def on_command(self, message: Command, heliostats: Sequence[str], now: float) -> None:
-        """Note a command that has left the plant."""
+        """Record a command that has left the plant."""
         for name in heliostats:
             mirror = self._mirrors[name]
             if message.name in ("AIM", "STANDBY"):
@@ -217,11 +218,11 @@ class QuietObserver(Judge):
             self._expect(mirror, may, _Order(message.identity, message.name, now, ends, within))
 
     def _commands(self, message: Command, now: float) -> bool:
-        """Whether the clusters must have the authority of a command."""
+        """Return whether the clusters must already know the authority that a command carries."""
         return message.token == self._token != 0 and now - self._token_at > GRANTED
 
     def on_emergency(self, name: str, heliostats: Sequence[str], now: float) -> None:
-        """Note DEFOCUS or STOW from the plant."""
+        """Record a DEFOCUS or STOW from the plant."""
         begins, ends, within = SAFE_ORDERS[name]
         for heliostat in heliostats:
             mirror = self._mirrors[heliostat]
@@ -239,7 +240,7 @@ class QuietObserver(Judge):
         mirror.order = order if may else None
 
     def _pointed(self, mirror: _Mirror, message: Command, now: float) -> None:
-        """Note a new point; what the cluster or the board may refuse is not known until then."""
+        """Record a new point; it counts as unknown if the cluster or the board may refuse it."""
         mirror.pointed_at = now
         taken = mirror.name in self._quiet and mirror.state not in (
             states.APPROACHING, states.SEARCHING, states.STOWING,
@@ -253,9 +254,9 @@ class QuietObserver(Judge):
     def on_refused(
         self, person: Person, token: int, asked: tuple[str, Sequence[str]], reason: str, now: float
     ) -> None:
-        """Note why one heliostat is refused, where the reason names what this observer knows.
+        """Record the reason why a command to one heliostat is refused, if it can be checked here.
 
-        It is judged at the next look, which knows of a fault that has just begun.
+        The reason is judged at the next look, which knows of a fault that has just begun.
         """
         del person, token
         heliostat = asked[1][0] if len(asked[1]) == 1 else ""
@@ -276,7 +277,7 @@ class QuietObserver(Judge):
         self._refusals.append((mirror, good, saw))
 
     def on_progress(self, message: Progress, now: float) -> None:
-        """Note the reports to the plant that orders are done."""
+        """Record that the plant was told that orders are done."""
         del now
         if message.stage is Stage.DONE:
             for name in message.heliostats:
@@ -285,7 +286,7 @@ class QuietObserver(Judge):
                     order.identity = ""
 
     def on_alarm(self, alarm: Alarm, now: float) -> None:
-        """Note an alarm of the plant: whom it names need not work."""
+        """Record an alarm of the plant; the heliostats that it names need not work."""
         del now
         key = alarm.condition, alarm.subject
         if alarm.active:
@@ -294,7 +295,7 @@ class QuietObserver(Judge):
             self._alarms.pop(key, None)
 
     def on_end(self, now: float) -> None:
-        """Note that the plant's program has ended, and its alarms with it."""
+        """Record that the plant program, and its alarms with it, has ended."""
         del now
         self._alarms.clear()
 
@@ -312,11 +313,11 @@ class QuietObserver(Judge):
         Parameters
         ----------
         plant
-            None: it does not run.
+            The plant; None if it is not running.
         carried
-            Clusters that the plant reaches.
+            Clusters that the plant can reach.
         rest
-            When the last fault that concerns each heliostat ended, s.
+            When the last fault affecting each heliostat ended, s.
         now
             s.
         """
@@ -344,7 +345,7 @@ class QuietObserver(Judge):
         self._reasoned(now)
 
     def _reasoned(self, now: float) -> None:
-        """Judge the reasons of refusals since the last look, where nothing has failed meanwhile."""
+        """Judge the reasons for refusals since the last look, if nothing has failed since then."""
         refusals, self._refusals = self._refusals, []
         for mirror, good, saw in refusals:
             if mirror.name in self._quiet:
@@ -367,7 +368,7 @@ class QuietObserver(Judge):
         return all(held.get(name) == value for name, value in mirror.own.items())
 
     def _served(self, mirror: _Mirror, now: float) -> None:
-        """Check that SUN and STATUS come at their rates."""
+        """Check that SUN and STATUS arrive at their rates."""
         account = mirror.account
         age = now - account.sun_at
         saw = f"the last sun has reached it {age:.1f} s ago, limit {SUN_EVERY:g} s"
@@ -377,7 +378,7 @@ class QuietObserver(Judge):
         self._calmly(age <= STATUS_EVERY, now, mirror, saw)
 
     def _told_off(self, mirror: _Mirror) -> float:
-        """Return when the cluster last sent DEFOCUS or STOW to it, s."""
+        """Return when the cluster last sent DEFOCUS or STOW to a heliostat, s."""
         safe = self._clusters[mirror.cluster].frames.safe
         never = -inf
         return max(safe.get(mirror.account.address, never), safe.get(wire.BROADCAST, never))
@@ -388,7 +389,7 @@ class QuietObserver(Judge):
         if order is None:
             return
         ordinary = order.name in ORDERS
-        # A mirror that turned away without following the sun stows by itself, whoever commands.
+        # A heliostat that turned away without following the sun stows by itself, despite commands.
         void = ordinary and order.name != "APPROACH" and mirror.state == states.STOWING
         void |= ordinary and now - self._token_at < GRANTED
         if void or (ordinary and self._told_off(mirror) >= order.at):
@@ -409,7 +410,7 @@ class QuietObserver(Judge):
         self._calmly(not order.identity or passed <= TOLD_WITHIN, now, mirror, saw)
 
     def _stays(self, mirror: _Mirror, before: int, now: float) -> None:
-        """Check that a mirror does not leave its work by itself."""
+        """Check that a heliostat does not stop working by itself."""
         falls = before in _WORKS and mirror.state in _FALLS
         if falls and self._reaches and self._is_own(mirror):
             passed = now - self._told_off(mirror)
@@ -417,7 +418,7 @@ class QuietObserver(Judge):
             self._calmly(passed <= CROSSING, now, mirror, saw)
 
     def _on_point(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
-        """Check that the beam is on its aim, or at standby, by the steps that were made."""
+        """Check that the beam is at its aim or standby point, according to the steps made."""
         tracks = mirror.state == states.TRACKING
         point = mirror.aim if tracks else mirror.standby
         stands = mirror.state == states.IDLE and mirror.account.by_way and not mirror.elsewhere
@@ -438,8 +439,8 @@ class QuietObserver(Judge):
         self._calmly(miss <= limit or now < mirror.due_at, now, mirror, saw)
 
     def _proven(self, mirror: _Mirror, plant: PlantController, sun: FloatArray, now: float) -> None:
-        """Check that an emergency that has been carried out is proven."""
-        order = plant.sentinel.order if plant.sentinel.on else None  # withdrawn: nobody proves it
+        """Check that an emergency order that was carried out is also confirmed as done."""
+        order = plant.sentinel.order if plant.sentinel.on else None  # not if withdrawn
         if order is None or not self._is_own(mirror):
             mirror.off_since = None
             return

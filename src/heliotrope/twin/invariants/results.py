@@ -1,11 +1,11 @@
-"""The observer of results: what visits produce, compared with the photographs that were taken.
+"""The observer of results: the results of visits, compared with the photographs taken.
 
 The camera reports each photograph to the observer, which reads the step counts of the true
 heliostat at that moment. A sighting that the plant stores must have the time, the point and the
 step counts of a photograph, and the true sun vector. A result must state the number of sightings
 that it added, and its errors must be those of the two calibrations, before and after. The store and
-the logbook must contain it, and a restarted program must know what the previous program knew (16).
-Visits without any result must not continue indefinitely (L2).
+the logbook must contain it, and a restarted program must know what the previous program knew
+(invariant 16). Visits without any result must not continue indefinitely (L2).
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -24,29 +24,30 @@ from heliotrope.store.records import Records
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.invariants.invariants import L2, Judge
 
-#: Times of a sighting and of its photograph agree to within this, s.
+#: The times of a sighting and of its photograph agree to within this, s.
 SAME = 1e-3
-#: A sighting's sun is within this of the true one, rad; its point of the one that was read, m.
+#: Tolerance of a sighting's sun vector from the true one, rad; and of its point from the measured
+#: point, m.
 SUN_WITHIN, POINT_WITHIN = 1e-4, 1e-6
-#: Step counts of a sighting, interpolated between answers of a board, differ by at most this from
+#: Step counts of a sighting, interpolated between replies of a board, differ by at most this from
 #: those at the photograph, steps.
 COUNTS_WITHIN = 60.0
 #: A result is shown within this time after it is made, s.
 SHOWN_WITHIN = 1.0
 #: Errors of a result agree with the observer's own to within this share, and this, rad.
 SHARE, ERROR_WITHIN = 0.05, 2e-5
-#: Visits of one mirror in a row that may bring nothing, for which no operator has asked: nine joint
-#: ones in which its beam is looked for, and some alone.
+#: Number of consecutive visits of one heliostat that may yield nothing and that no operator has
+#: requested: nine joint visits in which its beam is searched for, and some visits alone.
 RETRIES = 14
-#: Visits alone in a row in which a beam may be searched for in vain, for which no operator has
-#: asked: the plant's program rests for longer than a day of `days` after each.
+#: Number of consecutive visits alone in which a beam may be searched for in vain and that no
+#: operator has requested: the plant waits for longer than a day of `days` after each.
 SEARCHES = 3
-#: Results in a row, of mirrors that photographs show, that do not all bring nothing though no
-#: visit broke off: so many, or all of the field but one, of so many visits.
+#: Among this many consecutive results (or all of the field but one) from this many visits, at least
+#: one must yield something, if photographs show the heliostats and no visit was broken off.
 BARREN, BARREN_VISITS = 5, 4
-#: Results at one target within this time are of one visit, s.
+#: Results at one target within this time belong to one visit, s.
 _ONE_VISIT = 5.0
-#: Results of visits that broke off: what they brought is not counted.
+#: Outcomes of visits that were broken off, whose results are not counted.
 _BROKEN = (
     CalibrationOutcome.REFUSED,
     CalibrationOutcome.TAKEN_OUT,
@@ -56,7 +57,10 @@ _BROKEN = (
 
 @dataclass(frozen=True)
 class Picture:
-    """A photograph of one beam: s of the clock, target, point as read, and true step counts."""
+    """A photograph of one beam.
+
+    Its time on the clock, s, its target, the measured point, and the heliostat's true step counts.
+    """
 
     at: float
     target: str
@@ -66,7 +70,7 @@ class Picture:
 
 @dataclass
 class _Account:
-    """The observer's knowledge of one heliostat's learning."""
+    """The observer's record of the photographs and results of one heliostat."""
 
     pictures: list[Picture] = field(default_factory=list)
     kept: int = 0
@@ -74,9 +78,9 @@ class _Account:
     version: int = 0
     result_version: int = 0  # version at its last result
     before: Mechanism | None = None
-    vain: int = 0  # visits in a row that brought nothing
-    searched: int = 0  # visits in a row in which no beam was found by a search
-    typed: int = 0  # times that a person has set parameters, which the plant will believe
+    vain: int = 0  # consecutive visits that yielded nothing
+    searched: int = 0  # consecutive visits in which a search found no beam
+    typed: int = 0  # times that an operator has set parameters, which the plant will believe
 
 
 class ResultObserver(Judge):
@@ -119,29 +123,32 @@ class ResultObserver(Judge):
         self._boards = {board.outfit.name: board for board in boards}
         self._accounts = {name: _Account() for name in self._boards}
         self._dark, self._together = frozenset(dark), together
-        self._barren: list[CalibrationEntry] = []  # results in a row
+        self._barren: list[CalibrationEntry] = []  # consecutive results
         self._results: set[tuple[str, float]] = set()
         self._program: Operations | None = None
         self._checked_at = start
 
     def photographed(self, heliostat: str, target: str, point: FloatArray, now: float) -> None:
-        """Note a photograph at the moment of its exposure."""
+        """Record a photograph at the moment of its exposure."""
         board = self._boards[heliostat]
         counts = np.array([axis.turned for axis in board.axes], dtype=np.float64) - board.slip
         self._accounts[heliostat].pictures.append(Picture(now, target, point, counts))
 
     def asked(self, heliostats: Sequence[str]) -> None:
-        """Note that an operator wants heliostats calibrated now, whatever the previous result."""
+        """Record that an operator requests a calibration now, whatever the previous result was."""
         for name in heliostats:
             self._accounts[name].vain = self._accounts[name].searched = 0
 
     def typed(self, heliostats: Sequence[str]) -> None:
-        """Note that an operator has set parameters: the next version may be theirs, no visit's."""
+        """Record that an operator has set parameters.
+
+        The next version may then be the operator's, and not the result of a visit.
+        """
         for name in heliostats:
             self._accounts[name].typed += 1
 
     def look(self, operations: Operations | None, now: float) -> None:
-        """Check the results since the last check; None: the plant program is not running."""
+        """Check the results since the last check; ``operations`` is None while no plant runs."""
         if operations is None:
             return
         begins = operations is not self._program
@@ -152,7 +159,7 @@ class ResultObserver(Judge):
         new = [result for result in results if (result.heliostat, result.at) not in self._results]
         for entry in reversed(new):
             self._results.add((entry.heliostat, entry.at))
-            # One from just before the program stood still is seen once it goes on.
+            # A result from just before the program froze is seen once the program continues.
             old = max(self._checked_at, self.start) - (entry.at - self._zero)
             passed = now - self._checked_at
             saw = f"a result that was not there {passed:.1f} s ago is {old:.1f} s older"
@@ -173,7 +180,7 @@ class ResultObserver(Judge):
             account.version, account.before = version, beliefs.present(name)
             account.result_version = version
         if begins:
-            # Sightings come back with the calibration that they led to.
+            # Sightings are stored with the calibration that they result in.
             saw = f"a new program knows calibration {version}, that before it {account.version}"
             self.check(16, version >= account.version, now, name, saw)
             saw = f"a new program knows {count} sightings, that before it {account.kept}"
@@ -189,7 +196,7 @@ class ResultObserver(Judge):
         account.kept, account.version = count, version
 
     def _photographs(self, name: str, new: Sightings, targets: Sequence[str], now: float) -> None:
-        """Check that sightings are photographs, with the true sun and counts of their moment."""
+        """Check that sightings match photographs, with the true sun and counts at their times."""
         account = self._accounts[name]
         for k, target in enumerate(targets):
             at = float(new.time[k]) - self._zero
@@ -263,7 +270,10 @@ class ResultObserver(Judge):
     def _error(
         self, said: float, what: str, by: Mechanism, sightings: Sightings, now: float, name: str
     ) -> None:
-        """Check an error of a result; one photograph may have come after it, to verify it."""
+        """Check the error that a result states.
+
+        One photograph may have been taken after the calibration, to verify it.
+        """
         if not isfinite(said):
             return
         errors = _misses(by, sightings)
@@ -274,7 +284,7 @@ class ResultObserver(Judge):
         self.check(16, near <= ERROR_WITHIN + SHARE * max(own), now, name, saw)
 
     def _noted(self, operations: Operations, entry: CalibrationEntry, now: float) -> None:
-        """Check that logbook and store have a result."""
+        """Check that the logbook and the store contain a result."""
         name, start = entry.heliostat, f"at {entry.target}: {entry.text}"
         events = operations.logbook.events(200)
         logged = any(
@@ -305,7 +315,7 @@ class ResultObserver(Judge):
 
 
 def _visits(results: Sequence[CalibrationEntry]) -> int:
-    """Return of how many visits some results are, in the order of their times."""
+    """Return the number of visits from which results, sorted by time, come."""
     last: dict[str, float] = {}
     count = 0
     for entry in results:
@@ -315,12 +325,12 @@ def _visits(results: Sequence[CalibrationEntry]) -> int:
 
 
 def _of_all(event: EventRow, entry: CalibrationEntry) -> bool:
-    """Whether an event is that of a visit of several that was refused as a whole."""
+    """Return whether an event reports a joint visit that was refused as a whole."""
     return event.who == entry.target and event.text.endswith(f" identified together; {entry.text}")
 
 
 def _misses(by: Mechanism, sightings: Sightings) -> FloatArray:
-    """Return by how much a mechanism misses sightings, rad, (M,)."""
+    """Return the angles by which a mechanism misses sightings, rad, (M,)."""
     pose = by.pose(sightings.counts)
     direction = sightings.destination - pose.vertex
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)

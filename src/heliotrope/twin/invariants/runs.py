@@ -1,9 +1,9 @@
-"""The observer of plant runs: a cluster obeys one at a time.
+"""The observer of plant runs: a cluster obeys only one at a time.
 
-A run that is obeyed has the lease, and keeps it as long as its leases reach the cluster in time. No
-motion command of another run may be sent on the bus before that lease has expired. The observer
-does not rely on what a cluster reports: leases count when they reach the cluster, and obedience is
-visible on the bus.
+A run that a cluster obeys holds the lease, and keeps it as long as its leases reach the cluster in
+time. No motion command of another run may be sent on the bus before that lease has expired. The
+observer does not rely on what a cluster reports: leases count when they reach the cluster, and
+obedience is visible on the bus.
 """
 
 from collections.abc import Iterable
@@ -13,25 +13,25 @@ SLACK = 0.1
 
 
 class RunAccount:
-    """Account of the leases that reached a cluster, and of the run that it obeys."""
+    """The leases that have reached a cluster, and the run that the cluster obeys."""
 
     def __init__(self) -> None:
         self._over: dict[str, float] = {}
         self._obeyed = ""
 
     def leased(self, run: str, lifetime: float, now: float) -> None:
-        """Note a lease that has reached the cluster."""
+        """Record a lease that has reached the cluster."""
         if run == self._obeyed and now >= self._over.get(run, now):
-            self._obeyed = ""  # it has lost the lease, and may or may not have it again
+            self._obeyed = ""  # the run has lost the lease, and may or may not hold it again
         self._over[run] = now + lifetime
 
     def forget(self) -> None:
-        """Note that the cluster's program has ended."""
+        """Record that the cluster program has ended."""
         self._over.clear()
         self._obeyed = ""
 
     def obeyed(self, orders: Iterable[str], now: float) -> str:
-        """Note a frame that carries out one of some orders; return the error, or "".
+        """Record a frame that carries out one of several orders; return an error in it, or "".
 
         Parameters
         ----------

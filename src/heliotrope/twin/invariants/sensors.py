@@ -1,4 +1,4 @@
-"""The observer of sensors: what readings the plant received, and whether it acted.
+"""The observer of sensors: the readings that the plant received, and whether it acted.
 
 A reading beyond its limit, or a missing reading, must be named by an alarm within 10 s, and take
 every beam off the receiver within 30 s, which is part of invariant 2. The limits are the observer's
@@ -14,25 +14,25 @@ from heliotrope.twin.boards.board import Board
 from heliotrope.twin.invariants.beams import NAMED_WITHIN, OFF_WITHIN
 from heliotrope.twin.invariants.invariants import Judge
 
-#: By reading: names of the alarms any of which names it, the limit, and for how long beyond it, s.
+#: For each reading: the alarms of which any one names it, the limit, and the delay beyond it, s.
 LIMITS = {
     "wind_gust": (("wind_gust_stow", "wind_gust_defocus"), 15.0, 3.0),
     "wind_mean": (("wind_mean_stow", "wind_mean_defocus"), 11.0, 0.0),
     "receiver_flux": (("receiver_flux_high",), 1.0, 1.0),
 }
-#: A reading older than this counts as gone, s.
+#: A reading older than this counts as missing, s.
 GONE = 5.0
 
 
 class SensorObserver(Judge):
-    """Observes what sensors gave the plant, and the mirrors that should have left.
+    """Observes the readings that the plant received, and heliostats that should have left.
 
     Parameters
     ----------
     start
-        Zero of the times that it reports, s.
+        Origin of the times that it reports, s.
     boards
-        Boards by name of the cluster.
+        Boards by cluster name.
 
     """
 
@@ -46,27 +46,30 @@ class SensorObserver(Judge):
         self._cut_at = dict.fromkeys(boards, start)
 
     def fed(self, name: str, value: float, now: float) -> None:
-        """Note a reading that the plant was given."""
+        """Record a reading that the plant was given."""
         if math.isfinite(value):
             self._value[name] = value, now
 
     def on_alarm(self, alarm: Alarm, now: float) -> None:
-        """Note an alarm of the plant."""
+        """Record an alarm of the plant."""
         del now
         (self._alarms.add if alarm.active else self._alarms.discard)(alarm.condition)
 
     def on_end(self, now: float) -> None:
-        """Note that the plant's program has ended, its alarms too; one that is frozen has them."""
+        """Record that the plant program has ended, and its alarms with it.
+
+        A frozen program keeps its alarms.
+        """
         self._alarms.clear()
         self._rests(now)
 
     def _rests(self, now: float) -> None:
-        """Begin anew: a plant that starts has given its sensors no time yet."""
+        """Restart the timing, because a plant that starts has not yet waited for its sensors."""
         self._since, self._value = dict.fromkeys(LIMITS), {}
         self.started_at = now
 
     def look(self, carried: Set[str], now: float, *, runs: bool) -> None:
-        """Judge all readings; ``carried``: clusters that the plant reaches."""
+        """Judge all readings; ``carried`` contains the clusters that the plant can reach."""
         for cluster in self._boards:
             if cluster not in carried:
                 self._cut_at[cluster] = now

@@ -1,10 +1,10 @@
 """The observer of displays: tables, heliostat pages, summary and events, against the truth.
 
-It makes the same requests as a page. It knows from the boards where their motors are and where
-their beams go, from the bus what they have reported and when, and from the operators what they have
-done. A row must be what was reported, and its age must be the true age; a calibration is shown with
-the error that follows from its own covariance; each action of an operator is an event, exactly
-once, and no event names an operator who did nothing (11).
+The observer makes the same requests as a page. It knows from the boards where their motors are and
+where their beams go, from the bus what the boards have reported and when, and from the operators
+what they have done. A displayed row must contain what was reported, and its age must be the true
+age; a calibration is shown with the error that follows from its own covariance; each action of an
+operator is an event, exactly once, and no event names an operator who did nothing (invariant 11).
 """
 
 from collections import deque
@@ -30,24 +30,24 @@ EVERY = 2.0
 #: A frame is kept for a second; a value waits up to a second for a connection, and may be in
 #: transit for another, s.
 FRAME, TRANSIT = 1.1, 2.2
-#: State and place of a row that is not live.
+#: State and surface displayed in a row that is not live.
 STALE, NOWHERE = 255, ""
-#: Step counts may be older than the row by this, for the way to the plant included, s: a cluster
-#: asks for them less often, and a question may be lost.
+#: Step counts may be older than the row by this, including transit to the plant, s: a cluster
+#: requests them less often, and a request may be lost.
 COUNTED = 10.0
-#: A row in a quiet stretch is at most this old, s.
+#: Maximum age of a row in an undisturbed period, s.
 OLD = 6.0
 #: Steps by which a shown count may be beyond those of the last seconds, and a share of their span.
 STEPS, AHEAD = 100.0, 0.3
 #: A beam that is shown on a surface has its point this near to it by the steps made, m, after it
 #: was sent there for this long, s.
 NEAR, SETTLED = 6.0, 20.0
-#: One that has turned by more steps than this within a time, s, is still on its way there; the
-#: longest way takes less than this, s.
+#: A heliostat that has turned by more than this many steps within this time, s, is still moving to
+#: its aim; the longest motion takes less than the last time, s.
 FOLLOWS, SLEW, LONGEST = 1000.0, 1.0, 60.0
 #: The predicted error of a row agrees with the observer's own to within this share.
 SHARE = 0.25
-#: An act of an operator is an event within this, s.
+#: An operator's action becomes an event within this time, s.
 NOTED_WITHIN = 1.0
 
 
@@ -65,9 +65,10 @@ class ShownObserver(Judge):
     targets
         Calibration targets.
     plant
-        Observer of the plant, which has the board reports and the holder of the authority.
+        Observer of the plant, which knows the boards' reports and the holder of the command
+        authority.
     persons
-        Names of the operators whose actions are reported to it.
+        Names of the operators whose actions are reported to this observer.
     dark
         Heliostats about which the plant file is wrong, so their beam positions are unknown.
 
@@ -108,11 +109,11 @@ class ShownObserver(Judge):
     # -- operators -----------------------------------------------------------------------------
 
     def acted(self, operations: Operations | None, person: str, word: str, now: float) -> None:
-        """Note an action of an operator in a program, whose event contains this word."""
+        """Record an operator's action in a program; the event's text must contain ``word``."""
         self._acts.append((now, person, word, operations))
 
     def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
-        """Note that an operator has taken heliostats out of service, or put them back."""
+        """Record that an operator has taken heliostats out of service, or put them back."""
         for name in heliostats:
             self._changed[name] = now
             if out:
@@ -125,7 +126,7 @@ class ShownObserver(Judge):
     def look(
         self, operations: Operations | None, quiet: Set[str], sun: FloatArray, now: float
     ) -> None:
-        """Check the displays; None: the plant program is not running, or is frozen."""
+        """Check the displays; ``operations`` is None if the plant is not running or is frozen."""
         for name, board in self._boards.items():
             steps = np.array([(a.turned, a.emitted) for a in board.axes], dtype=np.float64).T
             self._counts[name].append((now, steps - board.slip))
@@ -154,7 +155,7 @@ class ShownObserver(Judge):
         self._detail(operations, view, quiet, now)
 
     def _events(self, operations: Operations, now: float) -> None:
-        """Check that each act of an operator is an event, once, and nothing else is."""
+        """Check that each operator action produces exactly one event, and nothing else does."""
         for row in operations.logbook.events(100):
             key = (row.at, row.who, row.text)
             if row.who not in self._persons or key in self._judged:
@@ -197,40 +198,40 @@ class ShownObserver(Judge):
             reported = self._plant.reports(name, made - age - TRANSIT - FRAME)
             saw = f"it is shown as {states.STATES[state]}; it has not reported that"
             self.check(11, state in reported, now, name, saw)
-            if name in quiet:  # on a bad bus answers are lost, one after the other
+            if name in quiet:  # on a bad bus, replies are lost one after another
                 self._counted(name, frame.counts[row], made - age, now)
             place = operations.viewer.aim_names[int(frame.on[row])]
             self._placed(name, place, sun, now, calm=name in quiet)
         self._calibrations(operations, frame, quiet, sun, now)
 
     def _counted(self, name: str, counts: FloatArray, at: float, now: float) -> None:
-        """Check that shown step counts are those of the last seconds."""
+        """Check that the displayed step counts occurred within the last seconds."""
         low, high = self._span(name, at)
         shown = ", ".join(str(int(count)) for count in counts)
         saw = f"its counts are shown as {shown}; they were {low} to {high}"
         self.check(11, bool(((counts >= low) & (counts <= high)).all()), now, name, saw)
 
     def _span(self, name: str, at: float) -> tuple[FloatArray, FloatArray]:
-        """Return the least and the greatest step counts, (2,) each, that a row of a time shows.
+        """Return the least and the greatest step counts, each (2,), that a row may show.
 
-        Steps count once they are ordered of the motors, ahead of being made.
+        Steps count once they are sent to the motors, which is before they are made.
         """
         some = [c for when, c in self._counts[name] if when >= at - COUNTED]
         if self._boards[name].node is None or len(some) < 2 or any(self._boards[name].slip):
             return np.full(2, -inf), np.full(2, inf)
-        # Between two looks it may have begun a motion, answered, and been called back.
+        # Between two looks a heliostat may have begun a motion, replied, and been called back.
         some += [np.array([s, s], dtype=float) for s in self._plant.true_counts(name, at - COUNTED)]
         low, high = np.min(some, axis=(0, 1)), np.max(some, axis=(0, 1))
         room = STEPS + AHEAD * (high - low)
         return low - room, high + room
 
     def _placed(self, name: str, place: str, sun: FloatArray, now: float, *, calm: bool) -> None:
-        """Check that a beam that is shown on a surface is there, by the steps that were made."""
+        """Check that a beam shown on a surface is there, according to the steps made."""
         state, since = self._states[name]
         before = self._places.get(name)
         if before is None or before[0] != place or not calm:
             self._places[name] = before = place, now
-        aimed = self._plant.aimed(name)  # two looks may miss an aim that is taken back at once
+        aimed = self._plant.aimed(name)  # two looks may miss an aim that is withdrawn at once
         if not calm or now - max(since, before[1], aimed) < SETTLED:
             return
         works = state in (states.TRACKING, states.SEARCHING)
@@ -244,9 +245,10 @@ class ShownObserver(Judge):
             self.check(11, miss <= NEAR, now, name, saw)
 
     def _came(self, name: str, now: float) -> bool:
-        """Whether a mirror follows its aim by now, or has had the time of the longest way.
+        """Return whether a heliostat follows its aim, or has had the time for the longest motion.
 
-        Near the keyhole an axis turns far for a small way of the beam, longer than others turn.
+        Near the keyhole an axis turns far for a small motion of the beam, so it takes longer than
+        elsewhere.
         """
         some = [counts for at, counts in self._counts[name] if at >= now - SLEW]
         turned = float(np.ptp(np.stack(some), axis=0).max())
@@ -272,7 +274,7 @@ class ShownObserver(Judge):
                 continue
             self.check(11, at == record.at, now, name, saw)
             state, since = self._states[name]
-            # What its error is depends on the pose: it stands near that of its work.
+            # The error depends on the pose, so only a heliostat near its working pose is compared.
             works = state in (states.IDLE, states.TRACKING) and now - since > SETTLED
             if not works or name not in quiet:
                 continue
@@ -342,9 +344,9 @@ class ShownObserver(Judge):
 
 
 def _expected(operations: Operations, name: str, present: FloatArray, sun: FloatArray) -> float:
-    """Return the expected error of a mirror's normal at the receiver, rad, by its covariance.
+    """Return the error of a normal expected from its covariance, at the receiver, rad.
 
-    Of the two poses, it is the one nearer to the present counts (2,).
+    Of the two poses, the pose nearer to the present counts (2,) is used.
     """
     beliefs = operations.plant.beliefs
     record = beliefs.record(name)
@@ -354,7 +356,7 @@ def _expected(operations: Operations, name: str, present: FloatArray, sun: Float
     counts = track(record.mechanism(nominal), sun, np.asarray(aim), current=present).best_counts
     if not np.isfinite(counts).all():
         return inf
-    # Only what leads away from the aim counts; a mirror may stand along its beam without error.
+    # Only displacements away from the aim count; a shift along the beam causes no error.
     direction = np.asarray(aim) - record.mechanism(nominal).pose(counts).vertex
     slope = slope_of(record, nominal, counts, sun, np.asarray(aim)) @ across(direction).T
     return 0.5 * float(np.sqrt(np.trace(slope.T @ record.covariance @ slope)))

@@ -1,4 +1,4 @@
-"""The observer of tickets: whoever gives a command is told in time what becomes of it.
+"""The observer of tickets: the outcome of each command must be reported in time.
 
 A ticket states for each heliostat how far its command has progressed. While the plant program runs,
 a heliostat must have acknowledged the command, or the ticket must have ended for it, within a time
@@ -16,23 +16,24 @@ from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.twin.invariants._account import HeliostatAccount
 from heliotrope.twin.invariants.invariants import ASKED, L2, Judge
 
-#: A command that no heliostat has acknowledged has ended after this, s: it lives for 10 s.
+#: A command that no heliostat has acknowledged must end within this, s; its lifetime is 10 s.
 ENDS_WITHIN = 20.0
-#: Every ticket has ended after this, but those of parameters, which wait for a safe place, s.
+#: Every ticket must end within this, except parameter tickets, which wait for a safe position, s.
 OVER_WITHIN = 300.0
-#: A state may have been left this long before the command was accepted, s: reports are as old.
+#: A heliostat may have left the state this long before the command was accepted, since reports may
+#: be this old, s.
 _REPORTED = 2.2
-#: States that orders which anybody may give lead to; a mirror that is locked stays so. One in FAULT
-#: has obeyed STOW if it stands at stow in truth.
+#: States that result from orders that anyone may give; a locked heliostat stays locked. A heliostat
+#: in FAULT has obeyed STOW if it truly is at stow.
 _SAFE = {
     "DEFOCUS": (states.DEFOCUSED, states.STOWING, states.STOWED, states.LOCKED, states.FAULT),
     "STOW": (states.STOWED, states.LOCKED),
 }
-#: Commands that may wait for their turn or for a safe place, and stages of a command that is under
-#: way.
+#: Commands that may wait for their turn or for a safe position, and the stages of a command in
+#: progress.
 _WAIT = ("TRACK", "REFOCUS", "SEARCH", "PARAMETERS")
 _UNDER_WAY = (None, Stage.ACCEPTED, Stage.SENT)
-#: The shortest reason, characters.
+#: Minimum length of a reason, characters.
 _REASON = 8
 
 
@@ -57,22 +58,25 @@ class TicketObserver(Judge):
     def on_accepted(
         self, person: Person, token: int, ticket: Ticket, what: str, now: float
     ) -> None:
-        """Note the ticket of a command that the plant has accepted."""
+        """Record the ticket of a command that the plant has accepted."""
         del person, token, what
         self._open.append((now, ticket))
 
     def on_safe(self, person: Person, ticket: Ticket, what: str, now: float) -> None:
-        """Note the ticket of DEFOCUS or STOW, which anybody may give."""
+        """Record the ticket of a DEFOCUS or STOW, which anyone may order."""
         del person, what
         self._open.append((now, ticket))
 
     def on_end(self, now: float) -> None:
-        """Note that the plant's program has ended, and its tickets with it."""
+        """Record that the plant program, and its tickets with it, has ended."""
         del now
         self._open.clear()
 
     def look(self, now: float, *, runs: bool) -> None:
-        """Judge all tickets; ``runs``: the plant's program does, and has records to write to."""
+        """Judge all tickets.
+
+        ``runs`` means that the plant program is running and can write its records.
+        """
         if not runs:
             self._stood_at = now
             return
@@ -94,7 +98,7 @@ class TicketObserver(Judge):
         self._open = [(at, unfinished) for at, unfinished in self._open if not unfinished.finished]
 
     def _true(self, at: float, ticket: Ticket, now: float) -> None:
-        """Check that a mirror for which a ticket is done has been where its command leads."""
+        """Check that a heliostat reported as DONE has been in the requested state."""
         asked = ASKED.get(ticket.name) or _SAFE.get(ticket.name)
         if asked is None:
             return

@@ -1,4 +1,4 @@
-"""The observer of visits: what the plant learnt from photographs, against the true mirrors.
+"""The observer of visits: the plant's stored calibrations and sightings against the truth.
 
 It checks two things that the plant stores: a calibration, which must bring the heliostat's true
 beam to its aim within the calibration's own covariance (12), and a sighting, which must show the
@@ -21,15 +21,15 @@ from heliotrope.twin.boards.outfit import RECEIVER
 from heliotrope.twin.invariants.beams import ASTRAY
 from heliotrope.twin.invariants.invariants import Judge
 
-#: A sighting this far from the beam's true place is not of that beam, m: the noise of centroids,
-#: play of the gears and counts that are interpolated stay below it.
+#: A sighting this far from the beam's true position does not show that beam, m: centroid noise,
+#: gear backlash and interpolated counts cause smaller errors.
 FOREIGN = 1.0
 #: A calibration misses by at most this many of its own standard deviations, in the direction of the
-#: miss: one photograph at the deepest point of a swing is two of them away (`visits.swings`). And
-#: what its covariance need not hold, rad of beam in each direction: single steps, and step counts
-#: that are interpolated to the moment of a photograph.
+#: miss: one photograph at the deepest point of a swing is two of them away (`visits.swings`). The
+#: second number is the error that the covariance need not contain, rad of beam in each direction:
+#: single steps, and step counts interpolated to the moment of a photograph.
 DEVIATIONS, FLOOR = 3.0, 1e-4
-#: A sighting has the time of a photograph, to within this, s.
+#: A sighting has the time of a photograph to within this, s.
 SAME_TIME = 1.0
 
 
@@ -45,13 +45,14 @@ class VisitObserver(Judge):
     targets
         Calibration targets.
     away
-        Function that returns how far a POSIX time, s, is from that of the nearest photograph, s.
+        Function that returns the difference, s, between a POSIX time, s, and the time of the
+        nearest photograph.
     followed
         Whether visits follow the beam that they photograph, so that light from another beam is
         never stored; otherwise only a later photograph contradicts it.
     dark
-        Heliostats whose errors far exceed the priors; a covariance based on these priors is not
-        judged.
+        Heliostats whose errors far exceed the priors; their covariances, which are based on these
+        priors, are not judged.
 
     """
 
@@ -71,32 +72,33 @@ class VisitObserver(Judge):
         self._boards, self._targets = {b.outfit.name: b for b in boards}, tuple(targets)
         self._judged: set[tuple[str, int, float]] = set()
         self._kept: dict[str, int] = {}
-        self._slipped: set[str] = set()  # sightings from before tell nothing of now
+        self._slipped: set[str] = set()  # earlier sightings say nothing about the present state
 
     def on_end(self, now: float) -> None:
-        """Note that the plant program has ended; the next one knows what the store contains."""
+        """Record that the plant program has ended; the next one knows the contents of the store."""
         del now
         self._kept.clear()
 
     def look(self, plant: PlantController | None, sun: FloatArray, now: float) -> None:
-        """Check the calibrations since the last check; None: the plant is not running."""
+        """Check the calibrations since the last check; ``plant`` is None if it is not running."""
         if plant is None:
             return
         for name, board in self._boards.items():
             if any(board.slip):
                 self._slipped.add(name)
             record = plant.beliefs.record(name)
-            # Once: when the store brings it back, the mirror may have slipped.
+            # Judged only once: when the store returns a calibration, its heliostat may have
+            # slipped.
             if record is not None and (name, record.version, record.at) not in self._judged:
                 self._judged.add((name, record.version, record.at))
-                # What an operator types of a mirror is one true figure beside others that may be
-                # off.
+                # An operator enters one true parameter of a heliostat; its other parameters may
+                # be wrong.
                 if len(record.sightings):
                     self._believed(board, record, plant.beliefs.nominal(name)[0], sun, now)
             kept = plant.beliefs.known(name)
             known = self._kept.get(name, 0)
             if kept is None or len(kept.sightings) < known:
-                self._kept[name] = known = 0  # a person's parameters stand on none
+                self._kept[name] = known = 0  # an operator's parameters are based on no sighting
             if kept is not None and len(kept.sightings) > known:
                 self._kept[name] = len(kept.sightings)
                 new = kept.sightings.take(np.arange(known, len(kept.sightings)))
@@ -112,9 +114,10 @@ class VisitObserver(Judge):
         sun: FloatArray,
         now: float,
     ) -> None:
-        """Check where the true beam goes if the mirror is aimed by the plant's belief.
+        """Check where the true beam goes if the heliostat is aimed with the plant's calibration.
 
-        A mirror that has lost steps is left out: its photographs may be from before.
+        A heliostat that has lost steps is omitted, because its photographs may be older than the
+        loss.
         """
         if board.outfit.name in self._slipped:
             return
@@ -142,14 +145,14 @@ class VisitObserver(Judge):
                 self.check(12, deviations <= DEVIATIONS, now, name, saw)
 
     def _dated(self, name: str, sightings: Sightings, now: float) -> None:
-        """Check that sightings have the times of photographs, from which their suns follow."""
+        """Check that sightings have the times of photographs, which determine their sun vectors."""
         for at in sightings.time:
             away = self._away(float(at))
             saw = f"a sighting that the plant keeps is dated {away:.1f} s from any photograph"
             self.check(16, away <= SAME_TIME, now, name, saw)
 
     def _own(self, board: Board, sightings: Sightings, now: float) -> None:
-        """Check that sightings show the beam of the mirror itself."""
+        """Check that sightings show the heliostat's own beam."""
         pose = board.outfit.mechanism.pose(sightings.counts + np.asarray(board.slip))
         rays = reflect(sightings.source, pose.normal)
         for vertex, ray, point in zip(pose.vertex, rays, sightings.destination, strict=True):
@@ -159,7 +162,7 @@ class VisitObserver(Judge):
 
 
 def across(direction: FloatArray) -> FloatArray:
-    """Return unit vectors to the right of and above a direction (3,), (2, 3)."""
+    """Return unit vectors, (2, 3), to the right of and above a direction, (3,)."""
     right = np.cross(direction, (0.0, 0.0, 1.0))
     above = np.cross(right, direction)
     return np.stack([right / np.linalg.norm(right), above / np.linalg.norm(above)])
@@ -172,9 +175,9 @@ def slope_of(
     sun: FloatArray,
     aim: FloatArray,
 ) -> FloatArray:
-    """Return by how much the beam moves at an aim with each parameter of a calibration, (P, 3).
+    """Return the motion of the beam at an aim per unit of each calibration parameter, (P, 3).
 
-    As an angle at the mirror: the beam turns, and a mirror that stands elsewhere moves it too.
+    The motion is expressed as an angle at the mirror. It includes the effect of a displaced mirror.
     """
     slopes = []
     offset = aim - record.mechanism(nominal).pose(counts).vertex
@@ -191,6 +194,6 @@ def slope_of(
 
 
 def _passes(vertex: FloatArray, ray: FloatArray, point: FloatArray) -> float:
-    """Return the distance at which a ray (3,) passes a point (3,), m."""
+    """Return the distance of a ray from a point, m."""
     offset = point - vertex
     return float(np.linalg.norm(offset - ray * (offset @ ray)))

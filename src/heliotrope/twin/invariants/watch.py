@@ -1,4 +1,4 @@
-"""The observers of automatic control in a run, and the operator reports that they need."""
+"""The observers of automatic control in a run, and the operators' reports that they need."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from heliotrope.twin.invariants.visits import VisitObserver
 
 @dataclass(frozen=True)
 class Watch:
-    """The observers of automatic control, and of what the plant shows of it."""
+    """The observers of automatic control and of what the plant displays about it."""
 
     visits: VisitObserver
     day: DayObserver
@@ -31,46 +31,46 @@ class Watch:
     # -- reports of operators -------------------------------------------------------------------
 
     def acted(self, operations: Operations | None, person: Person, word: str, now: float) -> None:
-        """Note an act in a program; its event there has this word in it."""
+        """Record an action in a program; the event's text there must contain ``word``."""
         self.shown.acted(operations, person.name, word, now)
 
     def given(self, heliostats: Sequence[str], now: float) -> None:
-        """Note that heliostats were given to automatic control."""
+        """Record that heliostats were put under automatic control."""
         self.day.given(heliostats, now)
         self.progress.given(heliostats)
 
     def taken(self, heliostats: Sequence[str]) -> None:
-        """Note that an operator moves heliostats."""
+        """Record that an operator moves heliostats."""
         self.day.taken(heliostats)
         self.progress.taken(heliostats)
 
     def commanded(self, what: str, heliostats: Sequence[str]) -> None:
-        """Note a command of an operator that the plant has accepted."""
+        """Record an operator command that the plant has accepted."""
         self.progress.commanded(what, heliostats)
 
     def asked(self, heliostats: Sequence[str]) -> None:
-        """Note that an operator wants heliostats calibrated now."""
+        """Record that an operator requests the calibration of heliostats now."""
         self.results.asked(heliostats)
 
     def typed(self, heliostats: Sequence[str]) -> None:
-        """Note that an operator has set parameters of heliostats."""
+        """Record that an operator has set parameters of heliostats."""
         self.taken(heliostats)
         self.results.typed(heliostats)
 
     def emergency(self, *, on: bool) -> None:
-        """Note that an operator has raised an emergency, or that it was cleared."""
+        """Record that an operator has called an emergency, or that it was cleared."""
         self.progress.emergency(on=on)
 
     def took(self, operations: Operations, now: float) -> None:
-        """Note that an operator has taken the command authority."""
+        """Record that an operator has taken the command authority."""
         self.day.took(now)
         self.progress.took(operations, now)
 
     def switched(self, *, on: bool) -> None:
-        """Note that an operator switches calibration on or off."""
+        """Record that an operator switches calibration on or off."""
         self.progress.switched(on=on)
 
     def held(self, heliostats: Sequence[str], now: float, *, out: bool) -> None:
-        """Note that heliostats go out of service, or come back."""
+        """Record that heliostats are taken out of service, or put back."""
         self.progress.held(heliostats, now, out=out)
         self.shown.held(heliostats, now, out=out)

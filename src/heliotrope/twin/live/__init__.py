@@ -1,7 +1,7 @@
 """Simulated surroundings for a running plant, in paced or virtual time.
 
-Begin with `World`: its `ports` are passed to `plant.assembly.PlantAssembly`. `PacedLoop` runs both
-at a chosen multiple of real time.
+Begin with `World`: its `ports` are passed to `plant.assembly.PlantAssembly`. `PacedLoop` runs the
+plant and its surroundings at a chosen multiple of real time.
 """
 
 from heliotrope.twin.live.boards import BoardField

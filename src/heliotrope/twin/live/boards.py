@@ -32,25 +32,25 @@ def key_of(name: str) -> bytes:
 
 
 class BoardField:
-    """Boards of N heliostats.
+    """The boards of N heliostats.
 
     Parameters
     ----------
     clock
         Clock of the event loop.
     names
-        Heliostats.
+        Names of the heliostats.
     truth, believed
-        True mechanisms, and those that the boards store, (N,).
+        True mechanisms, and the mechanisms that the boards store, (N,).
     machines
         Limits and rest positions of each heliostat's drives.
     seed
-        Seed of flash and motors.
+        Seed of the flash and the motors.
 
     Attributes
     ----------
     boards
-        One board per name, in the same order; switched on by `bus`.
+        One board per name, in the same order; `bus` switches them on.
 
     Raises
     ------
@@ -80,7 +80,7 @@ class BoardField:
         return len(self.boards)
 
     def bus(self, rows: range) -> TwinBus:
-        """Return the bus of a cluster with some of the heliostats; its boards are switched on."""
+        """Return the bus of a cluster with some of the heliostats, and switch on their boards."""
         made = []
         for place, row in enumerate(rows):
             old = self.boards[row].outfit
@@ -91,7 +91,7 @@ class BoardField:
         return TwinBus(self._clock, [*made])
 
     def advance(self, milliseconds: int) -> None:
-        """Run each board when it is due, on the clock's time."""
+        """Run each board when it is due, following the clock."""
         del milliseconds
         now = self._clock.monotonic()
         for board in self.boards:
@@ -99,12 +99,15 @@ class BoardField:
                 board.step(now)
 
     def stand(self) -> tuple[FloatArray, FloatArray]:
-        """Return true normals and vertices, (N, 3)."""
+        """Return the true normals and vertices, each (N, 3)."""
         pairs = [board.mirror() for board in self.boards]
         return np.stack([n for _, n in pairs]), np.stack([v for v, _ in pairs])
 
     def errors(self, sun: FloatArray, aims: FloatArray) -> FloatArray:
-        """Return the error of each normal at its aim (N, 3), rad, (N,); NaN if not tracking."""
+        """Return the error of each normal at its aim, rad, (N,); NaN for a heliostat not tracking.
+
+        ``aims`` has shape (N, 3), m.
+        """
         normal, vertex = self.stand()
         required = bisector(sun, normalize(aims - vertex))
         off = np.arcsin(np.clip(np.linalg.norm(np.cross(normal, required), axis=-1), 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""Simulated surroundings of a plant: a field on buses, clusters, cameras, and the truth.
+"""Simulated surroundings of a plant: a field on buses, clusters, cameras, and true values.
 
 `World` provides the ports of `plant.assembly.PlantAssembly`. Everything runs in one event loop: the
 plant program and its operations, a cluster program for each bus, the field in ticks of 50 ms.
@@ -83,20 +83,20 @@ class WorldOptions:
     rendered
         Whether photographs are rendered and evaluated; otherwise centroids are returned with noise.
     worker
-        Runs computations outside the event loop; None: there is none, as in virtual time.
+        Runs computations outside the event loop; None if there is no worker, as in virtual time.
     installed
-        Function that derives the true mechanisms from the nominal ones; None: with errors as large
-        as in Malan's field.
+        Function that derives the true mechanisms from the nominal ones; if None, the errors are as
+        large as in Malan's field.
     boards
         Whether each heliostat is a board with the real firmware; for small plants.
     centroid
-        Variance of centroids that are not photographed, m².
+        Variance of centroids that are returned without a photograph, m².
     link
-        Function that returns a cluster's end of the link to its plant, by cluster name; None: both
-        ends are in this process, and `World.links` has the plant's ends.
+        Function that returns a cluster's end of the link to its plant, by cluster name; if None,
+        both ends are in this process, and `World.links` contains the plant's ends.
     bus_key
-        Key that signs the frames on every bus; b"": frames are not signed, and a field of arrays
-        obeys every frame.
+        Key that signs the frames on every bus; with b"", frames are not signed, and a field of
+        arrays obeys every frame.
     pty
         Whether the bus of boards is a pseudo-terminal, which the cluster opens as a serial port.
     """
@@ -125,10 +125,10 @@ class World:
     ----------
     design
         The plant: groups of any kind of mechanism with two drives and a machine table, each
-        heliostat in a cluster. Its mechanisms count as nominal, and its local controllers store
-        them with the parameters of its heliostats.
+        heliostat in a cluster. Its mechanisms count as nominal; the local controllers store the
+        nominal mechanisms with the parameters of the plant's heliostats.
     clock
-        Clock of the event loop in which it will run.
+        Clock of the event loop in which the world will run.
     options
         See `WorldOptions`.
 
@@ -145,12 +145,12 @@ class World:
     buses
         Bus of each cluster.
     clusters, far
-        Programs of the clusters; and their ends of the links to an external plant, to be run within
-        `running`.
+        Programs of the clusters; the clusters' ends of the links to an external plant, to be run
+        within `running`.
     cameras
-        Cameras of the targets; None if the plant has its own, which receive photographs.
+        Cameras of the targets; None if the plant has its own cameras, which receive photographs.
     flux
-        Sensor of the flux on the receivers; None without a receiver.
+        Sensor of the flux on the receivers; None if there is no receiver.
     beats
         Number of ticks skipped because the computer was too slow.
 
@@ -241,7 +241,7 @@ class World:
         self.buses[name] = bus
 
     def _serial(self, boards: TwinBus) -> Bus:
-        """Return a serial bus that leads to boards."""
+        """Return a serial bus that is connected to boards."""
         # Only this function needs the serial port library.
         from heliotrope.cluster.serial_bus import SerialBus
 
@@ -308,7 +308,7 @@ class World:
         return np.asarray(mixed / np.linalg.norm(mixed))
 
     def mirrors(self) -> list[TrueMirror]:
-        """Return the mirrors whose light may be on a target."""
+        """Return the mirrors whose light may fall on a target."""
         light, stand = self.sun(), self.field.stand()
         mirrors: dict[str, TrueMirror] = {}
         for target in (*self.design.targets, *self.faces):
@@ -329,7 +329,7 @@ class World:
         return np.asarray(self.field.errors(self.sun(), self._aims)[self._rows])
 
     async def _turn(self) -> None:
-        """Advance the field, one tick at a time."""
+        """Advance the field tick by tick."""
         done = self.clock.monotonic()
         while True:
             await asyncio.sleep(_TICK)
@@ -340,7 +340,10 @@ class World:
             self.field.advance(50 * ticks)
 
     def put_up(self) -> None:
-        """Set a field of arrays to tracking, as on a working day; a plant must control it."""
+        """Set a field of arrays to tracking, as on a working day.
+
+        The plant must control the field.
+        """
         gps = gps_seconds(self.clock.utc())
         utc = self.clock.utc().timestamp()
         values = sun.broadcast_values(round(gps), utc, self.design.site)
@@ -358,14 +361,14 @@ class World:
 
 
 def steps_every(heliostats: int) -> int:
-    """Return the time between requests for the step counts of a plant's heliostats, s."""
+    """Return the time between requests for step counts in a plant of a given size, s."""
     return 1 if heliostats <= _SMALL else _STEPS_EVERY
 
 
 def true_mechanisms(design: Plant, options: WorldOptions) -> Mechanism:
     """Return the true mechanisms of the simulation, in the order of the design, (N,).
 
-    They do not depend on the parameters of the heliostats in the design, which the simulated local
+    The true mechanisms do not depend on the parameters in the design, which the simulated local
     controllers store.
 
     Raises
@@ -378,7 +381,7 @@ def true_mechanisms(design: Plant, options: WorldOptions) -> Mechanism:
 
 
 def _installed(group: Heliostats, options: WorldOptions, number: int) -> Mechanism:
-    """Return the true mechanisms of a group; each group draws its own errors."""
+    """Return the true mechanisms of a group, whose errors are drawn separately."""
     if len(group.mechanism.driven) != 2:
         raise InputError(
             f"simulated plant: mechanisms of kind {group.mechanism.kind} have "
@@ -389,7 +392,7 @@ def _installed(group: Heliostats, options: WorldOptions, number: int) -> Mechani
 
 
 def together(parts: Sequence[Mechanism]) -> Mechanism:
-    """Return arrays of mechanisms as one array; different kinds become armatures with drives."""
+    """Join arrays of mechanisms to one array; different kinds become armatures with drives."""
     if len(parts) == 1:
         return parts[0]
     return kinds.of_armature(
@@ -405,7 +408,7 @@ def machines_of(design: Plant) -> list[Machine]:
     Raises
     ------
     InputError
-        No machine table, or one without a standby point.
+        If a machine table is missing, or has no standby point.
     """
     machines = [design.machine(name) for name in design.names]
     for name, machine in zip(design.names, machines, strict=True):

@@ -1,9 +1,9 @@
-"""An event loop whose time runs at a chosen speed, and waits for late timers.
+"""An event loop whose time runs at a chosen speed and waits for late timers.
 
 Loop time is wall time times the speed, but it never passes a timer that has not fired. If the
 computer is too slow for the speed, or stops for a while, simulated time slows down instead of
-jumping over leases and deadlines; `PacedLoop.lag` states by how much. Nor does loop time pass
-`PacedLoop.until`, which lets one program wait for another.
+jumping over leases and deadlines; `PacedLoop.lag` states by how much. Loop time does not pass
+`PacedLoop.until` either, which lets one program wait for another.
 """
 
 import asyncio
@@ -34,7 +34,10 @@ class _Pace(selectors.DefaultSelector):
         return self._start + self.speed * (self.wall() - self._begin) - self.lag
 
     def change(self, speed: float) -> None:
-        """Continue at another speed from now; at 0 time stands still but files are still served."""
+        """Continue at another speed from now on.
+
+        At speed 0, loop time stands still but files are still served.
+        """
         self.speed, self._begin, self._start = speed, self.wall(), self.now + self.lag
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
@@ -54,7 +57,7 @@ class _Pace(selectors.DefaultSelector):
         return list(events)
 
     def _advance(self, most: float) -> None:
-        """Advance time, but not beyond the next timer at ``most`` or beyond `until`."""
+        """Advance the loop time, but not beyond the next timer (``most``) nor beyond `until`."""
         target = self._target()
         self.lag += max(0.0, target - most - LATE, target - max(self.until, self.now))
         self.now = max(self.now, min(target, most, self.until))
@@ -98,7 +101,7 @@ class PacedLoop(asyncio.SelectorEventLoop):
 
     @property
     def speed(self) -> float:
-        """Loop seconds per second of wall time, if the computer keeps up; 0 stops the loop time."""
+        """Loop seconds per second of wall time if the computer keeps up; 0 stops the loop time."""
         return self._pace.speed
 
     @speed.setter
@@ -116,5 +119,5 @@ class PacedLoop(asyncio.SelectorEventLoop):
 
     @property
     def lag(self) -> float:
-        """Delay of the loop behind its speed, s of loop time."""
+        """Delay of the loop relative to its speed, s of loop time."""
         return self._pace.lag

@@ -15,7 +15,7 @@ _CAPACITY = 256
 
 
 class NearLink:
-    """One end; a `links.link.Link`.
+    """One end of the link; a `links.link.Link`.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class NearLink:
 
     @property
     def silent_for(self) -> float:
-        """0 s while it is connected."""
+        """Return how long the other end has been silent, s: always 0 while connected."""
         return 0.0 if self.connected else float("inf")
 
     @property
@@ -88,7 +88,7 @@ class NearLink:
         self._news.set()
 
     async def receive(self) -> bytes:
-        """Wait for the next message that has not expired."""
+        """Wait for the next unexpired message and return it."""
         while True:
             while self._waiting:
                 data, expires = self._waiting.popleft()
@@ -109,7 +109,10 @@ class NearLink:
 
 
 def near_pair(clock: Clock, names: tuple[str, str]) -> tuple[NearLink, NearLink]:
-    """Return two ends; the first bears the second name, because each end names the other side."""
+    """Return the two ends of a link.
+
+    The first end bears the second name, because each end is named after the other side.
+    """
     first, second = NearLink(names[1], clock), NearLink(names[0], clock)
     first.other, second.other = second, first
     return first, second

@@ -1,4 +1,4 @@
-"""Calibrations that a plant has saved and that a simulated field's local controllers store."""
+"""Calibrations saved by a plant, which a simulated field's local controllers store."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ BOARDS = "boards.npz"
 
 
 def write_boards(path: Path, records: Sequence[HeliostatCalibration]) -> None:
-    """Write the parameters of calibrations, for the local controllers of a simulated field."""
+    """Write the parameters of calibrations for the local controllers of a simulated field."""
     arrays = {}
     for i, stored in enumerate(by_model(records)):
         arrays[f"heliostats_{i}"] = np.array(stored.heliostats)
@@ -26,7 +26,7 @@ def write_boards(path: Path, records: Sequence[HeliostatCalibration]) -> None:
 
 
 def read_boards(path: Path, design: Plant) -> Plant:
-    """Return the plant with the heliostat parameters in a file."""
+    """Return the plant with the heliostat parameters read from a file."""
     with np.load(path) as arrays:
         for i in range(len(arrays.files) // 3):
             names = arrays[f"names_{i}"].tolist()

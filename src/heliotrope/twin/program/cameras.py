@@ -23,7 +23,7 @@ class TwinCameras:
     world
         The world.
     loop
-        Its event loop.
+        Event loop of the world.
     seed
         Seed of the sensors' noise.
     drawer
@@ -32,7 +32,7 @@ class TwinCameras:
     Raises
     ------
     InputError
-        A camera without a position.
+        If a camera has no position.
     """
 
     def __init__(
@@ -56,19 +56,22 @@ class TwinCameras:
                 self._scenes[camera.name] = Scene(camera, seen)
 
     def wait(self) -> None:
-        """Wait until the rendering process is ready, at first some seconds; call it in a thread."""
+        """Wait until the rendering process is ready; call this in a thread.
+
+        The first start takes several seconds.
+        """
         for name in list(self._scenes)[:1]:
             self.photograph(name)
 
     def photograph(self, name: str) -> Frame:
-        """Return a photograph from a camera, exposed now; call this in a thread.
+        """Take a photograph with a camera now and return it; call this in a thread.
 
         Raises
         ------
         FetchError
-            The rendering process has died.
+            If the rendering process has died.
         UnknownNameError
-            There is no such camera.
+            If there is no such camera.
         """
         if name not in self._scenes:
             raise UnknownNameError("camera", name, list(self._scenes))

@@ -1,4 +1,4 @@
-"""The folder through which a plant reaches a simulated field: plant file, links file, keys."""
+"""The folder through which a plant reaches a simulated field: plant file, links file and keys."""
 
 import secrets
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ PLANT, LINKS, KEYS = "plant.toml", "links.toml", "keys.toml"
 
 @dataclass(frozen=True)
 class TwinFolder:
-    """The files of a simulated field, and the addresses in them.
+    """The files of a simulated field and the addresses in them.
 
     Attributes
     ----------
@@ -63,7 +63,8 @@ def write_folder(
     folder
         Folder, which must not contain another simulated field.
     plant, serves
-        Host and port on which the plant listens for clusters, and of the field's own server.
+        Host and port on which the plant listens for clusters; host and port of the field's own
+        server.
     steps_every
         Time between requests for step counts, s.
 
@@ -106,12 +107,12 @@ def write_folder(
 
 
 def read_folder(folder: Path) -> TwinFolder:
-    """Return the files of an earlier simulated field, to run it again.
+    """Return the files of an earlier simulated field, so that it can run again.
 
     Raises
     ------
     FormatError
-        If the files are not those of a simulated field.
+        If the files do not belong to a simulated field.
     """
     file = read_links(folder / LINKS)
     found = urlsplit(file.document.twin)

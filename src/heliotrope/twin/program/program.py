@@ -56,11 +56,12 @@ class TwinOptions:
     Attributes
     ----------
     start
-        Simulated time at the start; None: it follows the computer's clock, as a real field does.
+        Simulated time at the start; None if the field follows the computer's clock, as a real field
+        does.
     speed
-        Simulated seconds per second; only with ``start``.
+        Simulated seconds per second of real time; only with ``start``.
     seed
-        Seed of the true installation errors, and of all noise.
+        Seed of the true installation errors and of all noise.
     boards
         Whether each heliostat is a board with the real firmware; for small plants.
     pty
@@ -109,7 +110,7 @@ class TwinProgram:
         self._parts: _Parts | None = None
 
     def loop(self) -> asyncio.AbstractEventLoop:
-        """Return a new event loop for the program, whose time stands until the field starts."""
+        """Return a new event loop for the program; its time stands still until the field starts."""
         if self._options.start is None:
             return asyncio.SelectorEventLoop()
         loop = PacedLoop(self._options.speed)
@@ -117,7 +118,7 @@ class TwinProgram:
         return loop
 
     async def run(self, ending: asyncio.Event) -> None:
-        """Run until ``ending`` is set."""
+        """Run until the event ``ending`` is set."""
         loop = asyncio.get_running_loop()
         paced = loop if isinstance(loop, PacedLoop) else None
         start = self._options.start
@@ -194,7 +195,7 @@ class TwinProgram:
         return self._parts
 
     async def _lead(self, world: World, cameras: TwinCameras, loop: PacedLoop | None) -> None:
-        """Start the field once the plant leads it."""
+        """Start the field once the plant has the lead of the clusters."""
         # Connecting and the first rendering take wall time; the plant's taking the lead takes
         # simulated time.
         await asyncio.to_thread(cameras.wait)
@@ -211,7 +212,7 @@ class TwinProgram:
         self._begun = True
 
     def _clock(self, clock: Clock, paced: PacedLoop | None) -> dict[str, Any]:
-        """Return the state of the clock: monotonic s, UTC, speed, and whether the field is up."""
+        """Return the clock's state: monotonic time (s), UTC, speed, and whether the field is up."""
         now = clock.monotonic()
         return {
             "now": now,
@@ -232,8 +233,9 @@ class TwinProgram:
 async def _hold(world: World, loop: PacedLoop) -> None:
     """Repeatedly hold the loop's time before a plant lease or a connection ends.
 
-    If the computer is too slow, everything takes longer, but nothing is lost by being late. A plant
-    that is connected to no cluster has ended, and a plant that sends nothing for long hangs.
+    If the computer is too slow, everything takes longer, but no lease or connection is lost by
+    being late. A plant that is connected to no cluster counts as ended, and a plant that has sent
+    nothing for a long time counts as hung.
     """
     said = time.monotonic()
     while True:
@@ -247,7 +249,7 @@ async def _hold(world: World, loop: PacedLoop) -> None:
 
 
 def _ends(cluster: Cluster, link: CarriedLink) -> float:
-    """Return how long time may run before a cluster must have heard from its plant, s."""
+    """Return for how long time may run before a cluster must have heard from its plant, s."""
     if not link.connected:
         return math.inf
     lease = cluster.lease_left
@@ -279,7 +281,7 @@ class _Go:
 
 
 async def _wall(seconds: float) -> None:
-    """Wait for wall time, because the loop's own time is slowed down."""
+    """Wait for a wall-clock duration, because the loop's own time may be slowed down."""
     await asyncio.to_thread(time.sleep, seconds)
 
 

@@ -1,4 +1,4 @@
-"""HTTP server of a simulated field: photographs, the state of its clock, true errors.
+"""HTTP server of a simulated field: photographs, clock state and true errors.
 
 The standard library's server answers each request in a thread; requests that concern the field are
 executed in the field's event loop. Photographs are rendered in a separate process
@@ -25,7 +25,7 @@ class _Server(ThreadingHTTPServer):
     allow_reuse_address = daemon_threads = True
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Print nothing: a plant that ends may leave requests whose replies it does not read."""
+        """Print nothing, because a plant that ends may leave replies unread."""
 
 
 class TwinServer:
@@ -36,17 +36,17 @@ class TwinServer:
     serves
         Host and port.
     secret
-        First part of every path; other paths are not found.
+        First part of every valid path; any other path is answered with "not found".
     clock
-        Returns the state of the clock; may be called in any thread.
+        Function that returns the state of the clock; may be called in any thread.
     loop
         The field's event loop.
     photograph
-        Takes a photograph with a camera, by name; called in a thread.
+        Function that takes a photograph with a named camera; called in a thread.
     errors
-        Returns the true errors; called in the loop.
+        Function that returns the true errors; called in the loop.
     begin
-        Starts the field; called in the loop.
+        Function that starts the field; called in the loop.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class TwinServer:
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
 
     def start(self) -> None:
-        """Start to serve requests."""
+        """Start serving requests."""
         self._thread.start()
 
     def close(self) -> None:
@@ -106,7 +106,7 @@ class TwinServer:
 
 
 def _asked(loop: asyncio.AbstractEventLoop, function: Callable[[], bytes]) -> bytes:
-    """Call a function in the loop and return its result."""
+    """Call a function in the event loop and return its result."""
 
     async def call() -> bytes:
         return function()

@@ -1,7 +1,7 @@
 """Operator actions at a plant with automatic control, through the same calls that a page makes.
 
-Each action that the plant accepts is reported to the observers. Who acts, and when, is determined
-elsewhere: see `shift` and `crew`.
+Each action that the plant accepts is reported to the observers. `shift` and `crew` determine who
+acts, and when.
 """
 
 import asyncio
@@ -43,13 +43,13 @@ class Acts:
     work
         Automatic control.
     operator
-        Operator who clears latched alarms and raises emergencies.
+        Operator who clears latched alarms and calls emergencies.
     watch
         Observers of automatic control, which are informed of each action.
     truth
         True imperfections of each heliostat, rad, by name and parameter.
     clock
-        True time.
+        Clock that shows true time.
     seed
         Seed of the actions.
 
@@ -87,12 +87,12 @@ class Acts:
         return self._clock.monotonic()
 
     def present(self) -> Operations | None:
-        """Return the operations of the plant; None while it does not run, or nobody is present."""
+        """Return the plant's operations; None while it is not running, or nobody is present."""
         away = self._operator.away or self._operator.waits
         return None if away else self._work.operations
 
     def acted(self, word: str, person: Person = ENGINEER) -> None:
-        """Report an action, whose event contains this word."""
+        """Report an action; the text of its event must contain ``word``."""
         self._watch.acted(self._work.operations, person, word, self.now())
 
     # -- giving back -------------------------------------------------------------------------
@@ -150,15 +150,15 @@ class Acts:
         Parameters
         ----------
         operations, person
-            The plant, and the person.
+            The plant's operations, and the operator on duty.
         most
             Longest time on duty, s.
         commands
-            Called each second with a chance of a fifth.
+            Function that is called each second with a probability of one fifth.
         reason
-            Reason for seizing the authority from its holder; "": it is taken when free.
+            Reason for seizing the authority from its holder; "" if it is taken only when free.
         leaves
-            Whether the person leaves without releasing the authority, so that it expires.
+            Whether the operator leaves without releasing the authority, so that it expires.
         """
         token = self._takes(operations, person, reason)
         until = self.now() + self.chance.uniform(_LEAST_DUTY, most)
@@ -189,7 +189,7 @@ class Acts:
     async def once(
         self, operations: Operations, person: Person, what: str, values: Sequence[float]
     ) -> None:
-        """Take the command authority for one field-wide command, and release it afterwards."""
+        """Take the command authority for one field-wide command, then release it."""
         token = self._takes(operations, person, "")
         await asyncio.sleep(_DONE)  # until the clusters have the new token
         self.command(operations, person, token, what, (), values)
@@ -216,7 +216,7 @@ class Acts:
         return token
 
     def commands(self, operations: Operations, person: Person, token: int) -> None:
-        """Command one heliostat."""
+        """Issue commands to one heliostat."""
         name = self.chance.choice(self.names)
         what = self.chance.choice(["IDLE", "TRACK", "APPROACH", "REFOCUS"])
         self.command(operations, person, token, what, (name,))
@@ -230,7 +230,7 @@ class Acts:
         names: Sequence[str],
         values: Sequence[float] = (),
     ) -> None:
-        """Issue a command to some heliostats, () for all."""
+        """Issue a command to some heliostats, or to all if ``heliostats`` is ()."""
         if what not in ("ROUGH", "LOCK_AIM"):
             self._watch.taken(names or self.names)
         ticket = operations.command(person, token, what, names, values)
@@ -267,7 +267,7 @@ class Acts:
     def points(
         self, operations: Operations, person: Person, token: int, names: Sequence[str]
     ) -> None:
-        """Set new standby points of some heliostats, or new aims on the receiver."""
+        """Set new standby points, or new aims on the receiver, for some heliostats."""
         what = self.chance.choice(("STANDBY", "AIM"))
         gives, about = {
             "STANDBY": (operations.standby, STANDBY),
@@ -304,7 +304,7 @@ class Acts:
     # -- what anybody may do -----------------------------------------------------------------
 
     async def takes_off(self, operations: Operations) -> None:
-        """Order a heliostat off, whether in a visit or not."""
+        """Order a heliostat off its target or the receiver, even during a visit."""
         name = self.chance.choice(self.names)
         self._watch.taken((name,))
         what = self.chance.choice(["DEFOCUS", "STOW"])
@@ -314,7 +314,7 @@ class Acts:
         self._withheld.add(name)
 
     async def holds(self, operations: Operations, person: Person = ENGINEER) -> None:
-        """Take a heliostat, even one locked by others, out of service; it goes to stow."""
+        """Take a heliostat out of service, even if others have locked it; it goes to stow."""
         name = self.chance.choice(self.names)
         if self._persons.locks and self._others.random() < 0.5:
             name = self._others.choice(sorted(self._persons.locks))
@@ -328,7 +328,7 @@ class Acts:
         self._withheld.add(name)
 
     def emergency(self, operations: Operations, person: Person, act: Act) -> None:
-        """Raise an emergency: automatic control releases all heliostats that it holds."""
+        """Call an emergency, which releases all heliostats from automatic control."""
         self._watch.taken(self.names)
         stand = {call.who: Act[call.act] for call in operations.plant.sentinel.calls}
         operations.emergency(person, act.name, "somebody is in the field")

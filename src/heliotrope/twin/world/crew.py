@@ -1,10 +1,11 @@
 """The people of a working day: two operators, a script, and a field attendant.
 
-They act at critical moments: when heliostats travel to a visit, between its photographs, while a
-heliostat is locked to write its parameters, or while beams are being separated. Two of them may act
-at the same time. Some time later the attendant withdraws emergencies, presses Resume, and gives the
-field back to automatic control. On every other day, on average, everyone leaves at lunchtime, and
-automatic control has the rest of the day. A run may plan their actions instead (`CrewAct`).
+The operators and the script act at critical moments: when heliostats travel to a visit, between its
+photographs, while a heliostat is locked to write its parameters, or while beams are being
+separated. Two people may act at the same time. Some time later the attendant withdraws emergencies,
+presses Resume, and gives the field back to automatic control. On every other day, on average,
+everyone leaves at lunchtime, and automatic control has the rest of the day. A run may plan their
+actions instead (`CrewAct`).
 """
 
 import asyncio
@@ -62,7 +63,7 @@ class CrewAct:
     after
         Time from the moment to the action, s.
     person
-        Who acts.
+        The person who acts.
     """
 
     what: str
@@ -85,8 +86,8 @@ class Crew:
     rough
         Whether the engineer sets all heliostats to coarse steps in the morning.
     planned
-        Planned actions, one after another; None: drawn at random. The attendant is there in any
-        case.
+        Planned actions, one after another; None if actions are drawn at random. The attendant is
+        always there.
     """
 
     def __init__(
@@ -123,7 +124,7 @@ class Crew:
     # -- looking after the field ---------------------------------------------------------------
 
     async def _cares(self) -> None:
-        """Withdraw emergencies, press Resume and give the field back, after a short delay."""
+        """Withdraw emergencies, press Resume and give the field back, each after a short delay."""
         while True:
             await asyncio.sleep(_LOOK)
             operations, now = self._acts.present(), self._acts.now()
@@ -140,7 +141,7 @@ class Crew:
     # -- acting --------------------------------------------------------------------------------
 
     async def _acts_as(self, person: Person) -> None:
-        """Act occasionally, at a critical moment."""
+        """Act from time to time, at a critical moment."""
         while True:
             await asyncio.sleep(self._chance.expovariate(1.0 / _PAUSE))
             await self._moment(self._chance.choice(MOMENTS))
@@ -153,7 +154,7 @@ class Crew:
                 await self._does(what, operations, person)
 
     async def _follows(self, planned: Sequence[CrewAct]) -> None:
-        """Act as planned, each time as soon as the moment comes."""
+        """Act as planned, each time as soon as the planned moment comes."""
         for act in planned:
             await self._moment(act.moment, inf)
             await asyncio.sleep(act.after)
@@ -163,7 +164,7 @@ class Crew:
                 await self._does(act.what, operations, act.person)
 
     async def _moment(self, moment: str, patience: float = _PATIENCE) -> None:
-        """Wait until a visit is at a stage, for at most ``patience`` s."""
+        """Wait until a visit reaches a stage, for at most ``patience`` s."""
         until = self._acts.now() + patience
         while self._acts.now() < until and moment not in self._moments():
             await asyncio.sleep(_LOOK)
@@ -203,7 +204,7 @@ class Crew:
             await self._duty(what, operations, person)
 
     async def _duty(self, what: str, operations: Operations, person: Person) -> None:
-        """Take the command authority, and command some or all heliostats."""
+        """Take the command authority and command some or all heliostats."""
         everybody = what == "rough" and person is ENGINEER
         commands = self._roughens if everybody else self._some
         if what == "points":
@@ -235,7 +236,7 @@ class Crew:
         self._acts.points(operations, person, token, names)
 
     def _some(self, operations: Operations, person: Person, token: int) -> None:
-        """Command one heliostat, a few, or most often none."""
+        """Issue commands to one heliostat or a few, or (most often) to none."""
         chance, acts = self._chance, self._acts
         names = chance.sample(acts.names, chance.randint(1, 3))
         does: list[Callable[[], None]] = [

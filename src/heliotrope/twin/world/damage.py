@@ -54,15 +54,15 @@ class SimulatedPlant(Protocol):
         ...
 
     def start_plant(self, group: asyncio.TaskGroup) -> None:
-        """Start the plant's program."""
+        """Start the plant program."""
         ...
 
     def crash_plant(self, now: float) -> None:
-        """End the plant's program at once."""
+        """Kill the plant program at once."""
         ...
 
     def edit_plant_file(self, fault: Fault) -> None:
-        """Write a different stow position of a heliostat into the plant file."""
+        """Write another stow position of a heliostat into the plant file."""
         ...
 
     def restore_store(self) -> None:
@@ -74,7 +74,7 @@ class SimulatedPlant(Protocol):
         ...
 
     def hang_plant(self, now: float, *, silent: bool, frozen: bool) -> None:
-        """Silence the plant's program, freeze it, or let it continue."""
+        """Silence the plant program, freeze it, or let it continue."""
         ...
 
 
@@ -107,7 +107,7 @@ class Damage:
         self.next = -math.inf
 
     def hinders(self, pod: Pod) -> bool:
-        """Whether a fault may keep the plant's orders from the heliostats of a cluster."""
+        """Return whether a fault may keep the plant's orders from a cluster's heliostats."""
         return not pod.runs or any(
             fault.kind.startswith("plant")
             or (fault.kind.startswith(_HINDERS) and self._of.pod_of(fault) is pod)
@@ -116,7 +116,7 @@ class Damage:
 
     @property
     def rest(self) -> dict[str, float]:
-        """When the last fault that concerns each heliostat ended, or will end, s."""
+        """Return when the last fault that affects each heliostat ended or will end, s."""
         return {
             board.outfit.name: max(
                 self._rest.get(key, -math.inf) for key in ("", pod.name, board.outfit.name)
@@ -126,7 +126,10 @@ class Damage:
         }
 
     def _concerns(self, fault: Fault, now: float) -> None:
-        """Record what a fault affects, and until when; a wrong time lasts to the end of the run."""
+        """Record what a fault affects, and until when.
+
+        A wrong time affects the plant to the end of the run.
+        """
         key = ""
         if fault.kind in _OF_BOARD:
             key = self._of.boards[fault.target].outfit.name
@@ -140,7 +143,7 @@ class Damage:
         self._rest[key] = max(self._rest.get(key, -math.inf), until)
 
     def look(self, now: float, group: asyncio.TaskGroup) -> None:
-        """Start and end the faults that are due."""
+        """Start and end all faults that are due."""
         changed = False
         while self._pending and self._begin + self._pending[0].at <= now:
             fault = self._pending.popleft()
@@ -204,7 +207,7 @@ class Damage:
             _strangers(pod, pod.boards.index(board), fault)
 
     def _exchanges(self, fault: Fault, now: float) -> None:
-        """Fit a spare board that was last used at stow on another heliostat."""
+        """Fit a spare board that was last used on another heliostat and has its counts at stow."""
         of, target = self._of, fault.target
         board, pod = of.boards[target], of.pod_of(fault)
         if target in self._own:
@@ -232,7 +235,7 @@ class Damage:
             self._of.pod_of(fault).observer.doubt(board)
 
     def _apply(self, group: asyncio.TaskGroup, now: float) -> None:
-        """Apply every lasting fault that is active now."""
+        """Apply every lasting fault that is currently active."""
         of = self._of
         everywhere = {fault.kind for _, fault in self._active}
         of.operator.away = "nobody_there" in everywhere
@@ -259,7 +262,7 @@ class Damage:
         of.hang_plant(now, silent=silent, frozen=frozen)
 
     def _file(self, fault: Fault | None, pod: Pod) -> dict[str, str]:
-        """Return the errors in the file of a cluster; see `Pod`."""
+        """Return the errors in a cluster's file; see `Pod`."""
         if fault is None:
             return {}
         name = self._of.boards[fault.target].outfit.name

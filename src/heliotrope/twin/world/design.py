@@ -1,4 +1,4 @@
-"""The plant file of a run, and what its boards should store."""
+"""The plant file of a run, and the items that its boards should store."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -35,7 +35,7 @@ def design_of(
     Parameters
     ----------
     fits
-        Heliostats.
+        The heliostats.
     homes
         Names of the heliostats of each cluster.
     scene

@@ -1,7 +1,7 @@
 """Faults of a simulated run, drawn from a seed as a list.
 
-A fault is data: kind, time, duration, heliostat, severity. The same seed yields the same list; a
-list that violates an invariant is reduced by leaving faults out (`shrunk`).
+A fault is data: kind, time, duration, heliostat, severity. The same seed yields the same list. A
+list that violates an invariant is reduced by omitting faults (`shrunk`).
 """
 
 import random
@@ -99,7 +99,7 @@ class Fault:
     kind
         One of `KINDS`.
     at, lasts
-        Start since the beginning of the run, s; duration, s, 0 for an instantaneous fault.
+        Start, in s since the beginning of the run; duration, s (0 for an instantaneous fault).
     target
         Index of the heliostat, for faults of a single heliostat.
     size
@@ -133,7 +133,7 @@ def drawn(
     seed
         Seed of the draw.
     seconds
-        Length of the run.
+        Length of the run, s.
     heliostats
         Number of possible targets.
     pause
@@ -141,8 +141,8 @@ def drawn(
     only
         Kinds to draw from; () for all.
     worlds
-        Names of `worlds.WORLDS`: some add kinds, and "swarm" draws the weights and the pause of
-        this run.
+        Names of `worlds.WORLDS`: some worlds add kinds of faults, and "swarm" draws the weights and
+        the pause of this run at random.
 
     Raises
     ------
@@ -186,7 +186,7 @@ def tick_jump(size: float) -> int:
 
 
 def time_jump(size: float) -> float:
-    """Return a jump of the cluster's time, s: from less than a second to years."""
+    """Return a jump of the cluster's time, s, which ranges from less than a second to years."""
     chance = random.Random(f"jump {size}")
     return chance.choice([-0.4, 0.4, -1.5, 2.5, -4.0, 7.0, -30.0, 100.0, -3600.0, 86400.0, -3e7])
 
@@ -204,9 +204,9 @@ def shrunk(
     Parameters
     ----------
     faults
-        A list that fails.
+        Faults with which a run fails.
     fails
-        Whether a run with the given list fails.
+        Function that returns whether a run with the given faults fails.
     most
         Maximum number of runs.
     """

@@ -21,13 +21,13 @@ class Instruments:
     Parameters
     ----------
     clock
-        True time.
+        Clock that shows true time.
     seed
         Seed of the weather and of the false readings.
     flux
-        Returns the true fraction of beams on the receiver.
+        Function that returns the true fraction of beams on the receiver.
     observer
-        Informed of each reading that the plant receives.
+        Observer that is informed of each reading that the plant receives.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Instruments:
         self._gust: tuple[float, float] = (-math.inf, 0.0)
 
     def gust(self, size: float) -> None:
-        """Start a gust of 10 to 25 m/s, for a ``size`` of 0 to 1."""
+        """Start a gust of 10 m/s (``size`` 0) to 25 m/s (``size`` 1)."""
         self._gust = self._clock.monotonic(), 10.0 + 15.0 * size
 
     def _true(self, name: str) -> float:
@@ -67,7 +67,7 @@ class Instruments:
         return mean if name == "wind_mean" else max(1.2 * mean, gust)
 
     def _shown(self, name: str) -> float | None:
-        """Return the reading of a sensor, None for no reading."""
+        """Return the reading of a sensor; None if the sensor supplies no reading."""
         lie, true = self.lies[name], self._true(name)
         if lie == "sensor_silent":
             return None

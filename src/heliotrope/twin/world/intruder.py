@@ -1,8 +1,8 @@
-"""An intruder on the bus: records and replays frames, forges them without token or key, adds noise.
+"""An intruder on the bus, who records, replays and forges frames and adds noise.
 
-Against an intruder who can replay recorded time and sun messages at the right moment, only the MAC
-protects, and it protects only what is stored (see `lcu.wire`). This intruder transmits at random
-moments, one frame at a time.
+Only the MAC protects against an intruder who can replay recorded time and sun messages at the right
+moment, and the MAC covers only stored items (see `lcu.wire`). This intruder has no token and no
+key, and transmits at random moments, one frame at a time.
 """
 
 import random
@@ -51,7 +51,7 @@ class Intruder:
         self._addresses = addresses
 
     def recorded(self, size: float) -> bytes:
-        """Return an earlier frame chosen by ``size`` (0 to 1), or b"".
+        """Return an earlier frame, chosen by ``size`` (0 to 1); b"" if none was recorded.
 
         Half of the frames chosen are recent commands, which may not have expired yet.
         """
@@ -62,7 +62,7 @@ class Intruder:
         return self._frames.data(int(part * count)) if count else b""
 
     def forged(self, target: int, size: float) -> bytes:
-        """Return a command to the heliostat at an index, with an invented token and key."""
+        """Return a command with an invented token and key for the heliostat at an index."""
         chance = random.Random(f"forgery {size}")
         name = chance.choice(WANTED)
         token, edition = chance.getrandbits(32) | 1, chance.randrange(1, 2**31)
@@ -84,13 +84,13 @@ class Intruder:
         )
 
     def safe(self, target: int, size: float) -> bytes:
-        """Return DEFOCUS or STOW for one heliostat or all, after a zero that ends any noise."""
+        """Return a DEFOCUS or STOW for one heliostat or all, after a zero that ends any noise."""
         chance = random.Random(f"safe {size}")
         to = chance.choice([self._addresses[target], wire.BROADCAST])
         sender = Sender(chance.choice([0, 77]), chance.getrandbits(16))
         return b"\0" + sender.frame(to, chance.choice(["DEFOCUS", "STOW"]))
 
     def noise(self, size: float) -> bytes:
-        """Return random bytes, terminated."""
+        """Return random bytes with a terminator."""
         chance = random.Random(f"noise {size}")
         return bytes(chance.randrange(256) for _ in range(chance.randint(1, 300))) + b"\0"

@@ -1,8 +1,8 @@
 """Maintenance staff in the environment "repairs": they lock, unlock, write and repair.
 
-Two people lock heliostats, each with their own lock, mostly heliostats that the other has locked
-too. They try to write to locked heliostats, declare the step counts of boards that do not know
-them, and confirm the contents of a restored store.
+Two people lock heliostats, each with their own lock, and mostly choose heliostats that the other
+person has already locked. They try to write to locked heliostats, declare the step counts of boards
+that do not know them, and confirm the contents of a restored store.
 """
 
 import math
@@ -40,18 +40,18 @@ class Maintenance:
     Parameters
     ----------
     operator
-        The operators; one of them writes parameters and declares counts.
+        The plant's operators, one of whom writes parameters and declares counts.
     boards
         All heliostats.
     clock
-        True time.
+        Clock that shows true time.
     seed
         Seed of their actions.
 
     Attributes
     ----------
     service
-        Locks of the plant's program, set by the owner; None while it does not run.
+        Locks of the plant program, set by the owner; None while the program is not running.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Maintenance:
             self._mends(plant)
 
     def _locks(self, service: Service) -> None:
-        """Take a heliostat out of service, mostly one that another person has locked."""
+        """Take a heliostat out of service, mostly one that the other person has locked."""
         locked = sorted(self._persons.locks)
         again = locked and self._chance.random() < _AGAIN
         name = self._chance.choice(locked if again else self._names)
@@ -110,7 +110,7 @@ class Maintenance:
         self._operator.counts["locks"] += 1
 
     def _returns(self, service: Service) -> None:
-        """Remove a lock, as its owner."""
+        """Remove a lock on behalf of its owner."""
         locks = self._persons.locks
         if locks and self._persons.sure:
             name = self._chance.choice(sorted(locks))
@@ -125,7 +125,7 @@ class Maintenance:
     def confirms(self, plant: PlantController) -> None:
         """Confirm a restored store: apply the present locks, and remove the old ones.
 
-        The tower's lock is removed last; then the standby points are sent again.
+        The tower's lock is removed last. Then the standby points are sent again.
         """
         service = self.service
         asks = service is not None and any(lock.who == OWNER for lock in service.out)
@@ -144,7 +144,7 @@ class Maintenance:
         self._operator.give(plant, "STANDBY")
 
     def _writes(self, plant: PlantController, name: str) -> None:
-        """Write a different stow position or counts to a locked heliostat, which later is stowed.
+        """Write a different stow position or counts to a locked heliostat, to be stowed later.
 
         The plant must refuse both, because the mirror could move while someone works on it.
         """
@@ -158,7 +158,7 @@ class Maintenance:
         self._written = name
 
     def _takes_off(self, plant: PlantController) -> None:
-        """Order two heliostats off by one command, only one of which a cluster may know."""
+        """Order two heliostats off with one command; a cluster may know only one of them."""
         names = self._chance.sample(self._names, min(2, len(self._names)))
         ticket = plant.defocus(VIEWER.name, names)
         self._observer.obeyed(VIEWER.name, "DEFOCUS", self._clock.monotonic(), ticket.identity)

@@ -1,10 +1,10 @@
 """Scripted operators at a real plant: shifts, commands and mistakes, drawn from a seed.
 
-An operator and an engineer move the heliostats from state to state, change aims, raise and withdraw
-emergencies, send parameters, and seize each other's authority. They also command with an authority
-that they have lost, and a viewer tries commands that the role does not allow. Every command that
-the plant accepts is reported to its observer. A rogue plant holds the plant's end of a line, with
-old tokens.
+An operator and an engineer move the heliostats from state to state, change aims, call and withdraw
+emergencies, send parameters, and seize each other's authority. They also issue commands with an
+authority that they have lost, and a viewer tries commands that the role does not allow. Every
+command that the plant accepts is reported to the plant's observer. A rogue plant sends commands
+with old tokens on the plant's end of a line.
 """
 
 import asyncio
@@ -54,7 +54,7 @@ class Maintenance(Protocol):
     """The maintenance staff in the field; see `world.maintenance`."""
 
     def acts(self, plant: PlantController) -> None:
-        """Do one thing."""
+        """Perform one action."""
         ...
 
     def confirms(self, plant: PlantController) -> None:
@@ -74,40 +74,41 @@ class Operator:
     Parameters
     ----------
     clock
-        True time.
+        Clock that shows true time.
     seed, habits
-        Seed of their actions, and how often they take each.
+        Seed of the operators' actions, and how often they take each action.
     panel
         Observers of the plant, which are informed of each accepted command and operator order.
     fits
         The heliostats.
     pods
-        Clusters whose lines the rogue uses.
+        Clusters whose lines the rogue plant uses.
     keep_out
         Centre of a keep-out volume, at which the operators occasionally aim.
     flux
-        Returns the fraction of beams on the receiver; None: sensors supply it.
+        Function that returns the fraction of beams on the receiver; None if sensors supply it.
 
     Attributes
     ----------
     plant
-        Set by the owner; None while the plant does not run.
+        The plant, set by the owner; None while the plant is not running.
     away
         Whether nobody is on duty.
     waits
         Whether the plant's program is frozen, so that it replies to no command.
     commands
-        Whether the operators hold the authority; otherwise it is left to automatic control.
+        Whether the operators hold the command authority; otherwise they leave it to automatic
+        control.
     counts
         Number of actions of each kind.
     refusal
         Reason for the plant's last refusal.
     maintenance
-        The maintenance staff; None: there is none. Set by the owner.
+        The maintenance staff, set by the owner; None if there is none.
     points
-        Points last accepted, ENU, m, by command (AIM, STANDBY) and heliostat.
+        Last accepted points, ENU, m, by command (AIM, STANDBY) and heliostat.
     panel
-        As given.
+        Observers of the plant.
     """
 
     def __init__(
@@ -140,13 +141,13 @@ class Operator:
         self._number = 0
 
     def begins(self, plant: PlantController | None) -> None:
-        """Record that the plant has started or (None) ended."""
+        """Record that the plant has started, or (if ``plant`` is None) ended."""
         self.plant = plant
 
     # -- authority -------------------------------------------------------------------------
 
     async def keep(self) -> None:
-        """Renew the authority and measure the flux once a second."""
+        """Renew the authority and measure the flux, once a second."""
         while True:
             due = self._clock.monotonic() + 1.0
             plant = self.plant
@@ -178,7 +179,7 @@ class Operator:
         return None
 
     def seize(self, plant: PlantController, person: Person) -> None:
-        """Put an operator on duty, who seizes the present authority."""
+        """Put an operator on duty, who seizes the authority from its holder."""
         try:
             token = plant.seize_authority(person, "on duty now").token
         except RefusedError:
@@ -194,7 +195,10 @@ class Operator:
         self._observer.granted(person, token, self._clock.monotonic(), seized=seized)
 
     def _change(self, plant: PlantController) -> None:
-        """Put another operator on duty, who seizes the authority or takes it once released."""
+        """Put another operator on duty.
+
+        The new operator seizes the authority, or takes it after its release.
+        """
         other = OPERATOR if self._duty is ENGINEER else ENGINEER
         if self._chance.random() < 0.5:
             with contextlib.suppress(RefusedError):
@@ -245,7 +249,7 @@ class Operator:
         token: int | None = None,
         values: tuple[float, ...] | None = None,
     ) -> Ticket | None:
-        """Issue a command, and report it to the observer if accepted; otherwise return None."""
+        """Issue a command and report it to the observer if accepted; otherwise return None."""
         who = person or self._duty
         mine = self._tokens.get(who.name, 0) if token is None else token
         names = heliostats or self._names
@@ -284,7 +288,7 @@ class Operator:
             each.on_accepted(who, token, ticket, what, self._clock.monotonic())
 
     def _into_keep_out(self, plant: PlantController) -> None:
-        """Request a motion that moves a beam through the keep-out volume, which must be refused."""
+        """Request a motion through the keep-out volume, which the plant must refuse."""
         name, mine = self._chance.choice(self._names), self._tokens.get(self._duty.name, 0)
         point = self._points((name,), self._keep_out, 0.5)
         what = self._chance.choice(["AIM", "STANDBY", "SEARCH"])
@@ -318,7 +322,7 @@ class Operator:
         return ()
 
     def onward(self, plant: PlantController) -> None:
-        """Advance one heliostat according to its state."""
+        """Advance one heliostat to the next state."""
         name = self._chance.choice(self._names)
         state = plant.field.of(name, plant.now()).state
         what = self._chance.choice(ONWARDS.get(state, ("APPROACH",)))
@@ -347,7 +351,7 @@ class Operator:
         self.give(plant, "LOCK", (self._chance.choice(self._names),))
 
     def _unauthorised(self, plant: PlantController) -> None:
-        """Command without authority: with an old or a foreign token, or as a viewer."""
+        """Issue a command without authority: with an old or a foreign token, or as a viewer."""
         what = self._chance.choice(["TRACK", "APPROACH", "AIM", "REFOCUS", "STANDBY"])
         name = self._chance.choice(self._names)
         other = OPERATOR if self._duty is ENGINEER else ENGINEER
@@ -368,7 +372,7 @@ class Operator:
         self.push(plant, self._safe(plant), items)
 
     def _safe(self, plant: PlantController) -> str:
-        """Return a heliostat, mostly one that may be written to."""
+        """Return a heliostat to which parameters may be written, in most cases."""
         safe = np.flatnonzero(plant.field.among(TAKES_POSE, plant.now()))
         names = [plant.field.names[row] for row in safe]
         return self._chance.choice(names if names and self._chance.random() < 0.8 else self._names)
@@ -437,12 +441,12 @@ class Operator:
                 self.raises(plant, other, act)
 
     def raises(self, plant: PlantController, who: Person, act: Act) -> EmergencyOrder:
-        """Raise an emergency, which anyone may do."""
+        """Call an emergency, which anyone may do."""
         self.raised(who, act)  # the plant raises its alarm before it replies
         return plant.raise_emergency(who.name, act)
 
     def raised(self, who: Person, act: Act) -> None:
-        """Record an emergency that an operator has raised."""
+        """Record an emergency that an operator has called."""
         self.counts["emergencies"] += 1
         for each in self.panel.each:
             each.on_call(who.name, act, self._clock.monotonic())
@@ -458,12 +462,12 @@ class Operator:
         return ticket
 
     def took_off(self, ticket: Ticket, what: str) -> None:
-        """Report DEFOCUS or STOW by the viewer."""
+        """Report a DEFOCUS or STOW that the viewer has ordered."""
         for each in self.panel.each:
             each.on_safe(VIEWER, ticket, what, self._clock.monotonic())
 
     def clear(self, plant: PlantController) -> set[str]:
-        """Withdraw an emergency order, acknowledge what awaits it; return what was accepted.
+        """Withdraw an emergency order, acknowledge latched conditions, and return what is accepted.
 
         The order of another operator remains until the next call.
         """
@@ -474,7 +478,7 @@ class Operator:
         return self._acknowledge(plant)
 
     def withdraws(self, plant: PlantController, owner: str) -> None:
-        """Withdraw an operator's order, as that operator, or as an engineer for a viewer."""
+        """Withdraw an operator's order as that operator, or as an engineer for a viewer."""
         who = OPERATOR if owner == OPERATOR.name else ENGINEER
         now = self._clock.monotonic()
         try:
@@ -485,7 +489,7 @@ class Operator:
         self._persons.withdrew(owner)
 
     def _acknowledge(self, plant: PlantController) -> set[str]:
-        """Acknowledge every latched condition; return those that the plant accepts.
+        """Acknowledge every latched condition; return the conditions that the plant accepts.
 
         The engineer acts for the supervisor.
         """
@@ -508,8 +512,9 @@ class Operator:
     def _stands_right(self, name: str) -> bool:
         """Inspect a heliostat whose step counts are in doubt.
 
-        If an operator confirmed it without looking, its beam could miss, which no software can
-        detect. Invariant 12 would then be violated by the operator, so these operators do look.
+        If an operator confirmed the counts without looking, the beam could miss its point, which no
+        software can detect. The operator would then violate invariant 12, so these operators do
+        look.
         """
         boards = (board for pod in self._pods for board in pod.boards)
         board = next(board for board in boards if board.outfit.name == name)
@@ -518,7 +523,7 @@ class Operator:
     # -- the rogue -------------------------------------------------------------------------
 
     async def _rogue(self) -> None:
-        """Send commands that bypass the plant, with an invalid or guessed token."""
+        """Send commands that bypass the plant, with an invalid or a guessed token."""
         now = self._clock.monotonic()
         void = [token for token, at in self._observer.old.items() if now - at > VOID_WITHIN]
         token = self._chance.choice([0, self._chance.getrandbits(32), *void[-2:], *void[-2:]])

@@ -24,8 +24,8 @@ from heliotrope.twin.cameras import ExactCamera, FieldSnapshot
 T = TypeVar("T")
 #: What a photograph may show instead of the heliostat's beam.
 LIES = ("still", "passing", "before")
-#: What may spoil the photographs of a stack, the rate of this relative to that of lies, the size of
-#: a lamp, m, and the longest time between photographs of a stack, s.
+#: What may spoil the photographs of a stack, how often relative to false photographs, the size of a
+#: lamp, m, and the longest time between photographs of a stack, s.
 SPOILS, _STACKS_SPOILT, _LAMP, _GAP = ("lamp", "cloud"), 0.1, 0.3, 20.0
 #: Variance of a centroid in the plane of the target, m².
 _CENTROID = 1e-4
@@ -38,7 +38,10 @@ _SPEED = 0.3
 
 @dataclass(frozen=True)
 class _Lie:
-    """A light on a target: position in its plane, m, (2,), velocity, m/s, and start time."""
+    """A false light on a target.
+
+    Its position in the target plane, m, (2,), its velocity, m/s, and its start time.
+    """
 
     kind: str
     place: FloatArray
@@ -49,7 +52,7 @@ class _Lie:
 
 @dataclass(frozen=True)
 class _Spoilt:
-    """What spoils photographs of a stack: a lamp at a point of the target, m, (2,), or less sun."""
+    """A disturbance of a stack: a lamp at a point of the target, m, (2,), or less sun."""
 
     kind: str
     place: FloatArray
@@ -64,13 +67,14 @@ class LyingCamera:
     Parameters
     ----------
     sight
-        True mirrors and sun.
+        The true mirrors and the sun.
     seed
         Seed of noise and lies.
     share
         Fraction of the photographs with which lies begin.
     waver
-        Standard deviation of a beam in each direction, in addition to that of its centroid, rad.
+        Standard deviation of a beam's fluctuation in each direction, in addition to the centroid
+        noise, rad.
     standing
         Whether every lie is a light that stays for minutes, such as a lamp or the beam of a
         heliostat left there.
@@ -82,8 +86,8 @@ class LyingCamera:
     taken
         Times of all photographs of single beams, s of the monotonic clock.
     told
-        Called with each of these photographs: heliostat, target, measured point, ENU, m, (3,), and
-        time.
+        Function called for each of these photographs with the heliostat, target, measured point,
+        ENU, m, (3,), and time.
     """
 
     def __init__(
@@ -103,7 +107,7 @@ class LyingCamera:
         self.on_photograph: Callable[[str, str, FloatArray, float], None] | None = None
 
     def away(self, at: float) -> float:
-        """Return the time to the nearest photograph, s; times are monotonic.
+        """Return the difference between a monotonic time and the nearest photograph's time, s.
 
         A sighting from a stack has the mid-time of the stack, which may lie between two
         photographs.
@@ -147,7 +151,7 @@ class LyingCamera:
         return _Spoilt("cloud", place, chance.uniform(0.2, 0.95), 0.0, chance.choice(_RUNS))
 
     async def beside(self, work: Callable[[], T]) -> T:
-        """Return the result of a computation."""
+        """Run a computation at once and return its result."""
         return work()
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
@@ -176,7 +180,7 @@ class LyingCamera:
         return shown
 
     def _wavered(self, target: Target, shot: Shot, heliostat: str) -> Shot:
-        """Return a photograph of the beam as deflected by the wind."""
+        """Return a photograph of the beam with its random fluctuation."""
         mirrors = {mirror.heliostat: mirror for mirror in self._sight.mirrors()}
         if (mirror := mirrors.get(heliostat)) is None:  # it is covered
             return shot

@@ -56,7 +56,7 @@ class Pod:
     name
         Name of the cluster.
     boards
-        Boards on its bus.
+        Boards on the cluster's bus.
     observer
         Observer of this cluster.
     clock, start
@@ -66,7 +66,7 @@ class Pod:
     chance
         Source of random clocks and seeds.
     errors
-        Errors of the cluster from the start.
+        Errors that the cluster has from the start.
 
     Attributes
     ----------
@@ -81,13 +81,13 @@ class Pod:
     plant
         Observer of the plant; set by the owner.
     answers
-        Observer of what boards and cluster report about themselves.
+        Observer of what the boards and the cluster report about themselves.
     lines
-        Observer of the line; None: a second plant occasionally takes it.
+        Observer of the line; None if a second plant occasionally takes the line over.
     counts
         Messages to the plant, by kind.
     freezes
-        Whether its program can be frozen.
+        Whether the cluster program can be frozen.
     file
         Errors in the cluster's file: the name that a heliostat has in it, or "" for a missing
         one.
@@ -138,11 +138,11 @@ class Pod:
 
     @property
     def runs(self) -> bool:
-        """Whether the cluster's program runs."""
+        """Whether the cluster program is running."""
         return bool(self._running)
 
     def start(self, group: asyncio.TaskGroup) -> None:
-        """Start the program with a new bus and a new end of the line; nothing is carried over."""
+        """Start the program with a new bus and a new end of the line, without any earlier state."""
         self.bus = self._new_bus()
         seed = self._chance.getrandbits(31)
         link = self.link = self.line.end(1, "plant", self.clock, seed=seed)
@@ -161,7 +161,7 @@ class Pod:
         ]
 
     def crash(self) -> None:
-        """Kill the program at whatever point it is; the network notifies the plant."""
+        """Kill the program at whatever point it is; the network then notifies the plant."""
         for task in self._running:
             task.cancel()
         self._running = []
@@ -173,7 +173,7 @@ class Pod:
             loop.kill(self.name)
 
     def edit(self, file: Mapping[str, str], group: asyncio.TaskGroup) -> None:
-        """Restart the program with a file, if the file is a different one; see ``file``."""
+        """Restart the program with another file, if ``file`` differs from the present one."""
         if file == self.file:
             return
         self.file = dict(file)
@@ -185,7 +185,7 @@ class Pod:
             self.start(group)
 
     def freeze(self, *, on: bool) -> None:
-        """Freeze the program, or let it continue."""
+        """Freeze the program or let it continue."""
         loop = asyncio.get_running_loop()
         if self.freezes and isinstance(loop, VirtualLoop):
             (loop.freeze if on else loop.thaw)(self.name)
@@ -225,7 +225,7 @@ class Pod:
         self.answers.heard(how, now)
 
     def answered(self, data: bytes, how: str, now: float) -> None:
-        """Pass on a reply to the cluster; store its states together with the true step counts."""
+        """Pass on a reply to the cluster, and store reported states with the true step counts."""
         self.observer.answered(data, how, now)
         self.answers.answered(data, how, now)
         if self.plant is None:
@@ -250,13 +250,13 @@ class _ClusterEar:
         self._observer = observer
 
     async def posted(self, data: bytes, now: float) -> None:
-        """Allow the cluster to send."""
+        """Let the cluster send."""
 
     def sent(self, data: bytes, now: float) -> None:
-        """Allow the cluster to send."""
+        """Let the cluster send."""
 
     async def waits(self) -> None:
-        """Allow the cluster to receive."""
+        """Let the cluster receive."""
 
     def received(self, data: bytes, now: float) -> None:
         """Record a lease."""
@@ -266,12 +266,12 @@ class _ClusterEar:
 
 
 class PlantEar:
-    """Listens at the plant's end of one line, reports to the observers, and can freeze the plant.
+    """Listens at the plant's end of a line, reports to the observers, and can freeze the plant.
 
     Parameters
     ----------
     pod
-        Cluster of the line.
+        The cluster at the other end of the line.
     panel
         Observers of the plant.
     """
@@ -297,18 +297,18 @@ class PlantEar:
             self._goes.set()
 
     async def posted(self, data: bytes, now: float) -> None:
-        """Judge a message that the plant hands to the link, which waits while it is frozen."""
+        """Judge a message that the plant hands to the link; hold it while the plant is frozen."""
         if self._ended:
             return
         self._plant.posted(tuple(self._addresses), decode(data), now)
         await self._goes.wait()
 
     async def waits(self) -> None:
-        """Allow the plant to receive, unless it is frozen."""
+        """Let the plant receive, unless it is frozen."""
         await self._goes.wait()
 
     def sent(self, data: bytes, now: float) -> None:
-        """Note a message that has left for the cluster."""
+        """Record a message that has left for the cluster."""
         message, observer = decode(data), self._pod.observer
         if isinstance(message, Lease):
             for each in self._judges:
@@ -337,13 +337,16 @@ class PlantEar:
                     each.on_command(message, whom, now)
 
     def _asked(self, message: Command | Parameters) -> tuple[str, tuple[str, ...]]:
-        """Return the order, and its heliostats."""
+        """Return the name of an order, and the heliostats that it concerns."""
         if isinstance(message, Command):
             return message.name, message.heliostats or tuple(self._addresses)
         return "PARAMETERS", (message.heliostat,)
 
     def order(self, message: Command | Parameters, now: float, *, known: bool) -> PlantCommand:
-        """Return an order for the ledger; ``known``: its token has been issued before."""
+        """Return an order for the ledger.
+
+        ``known`` means that its token has been issued before.
+        """
         name, whom = self._asked(message)
         until = self._plant.until(message.token, now + message.lifetime + UNDER_WAY)
         addresses = frozenset(self._addresses[heliostat] for heliostat in whom)

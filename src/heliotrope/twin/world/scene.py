@@ -51,9 +51,9 @@ class Scene:
     site, start
         Site, and UTC at the beginning.
     places
-        East and north of each heliostat, m; (): `outfits` draws them.
+        East and north of each heliostat, m; () if `outfits` draws them.
     keep_outs
-        Spheres that no beam may enter; the first is the one at which operators aim.
+        Spheres that no beam may enter; operators aim at the first.
     targets
         Calibration targets.
     lowest
@@ -84,7 +84,7 @@ USUAL = Scene(Site(37.4, -6.0, 100.0, name="simulation"), datetime(2026, 6, 21, 
 
 
 def scene_of(worlds: Sequence[str], seed: int, seconds: float, heliostats: int) -> Scene:
-    """Return the scene of a run: drawn in the worlds "place" and "day", otherwise the usual one.
+    """Return the scene of a run: drawn at random in "place" and "day", otherwise the usual one.
 
     The scene of "days" has the usual places, and a sun that crosses the zenith.
     """
@@ -111,7 +111,7 @@ def scene_of(worlds: Sequence[str], seed: int, seconds: float, heliostats: int) 
 
 
 def _clear_at_stow(places: Sequence[tuple[float, float]], suns: FloatArray, ball: Ball) -> bool:
-    """Return whether all beams at stow are clear of a ball, for sun vectors (S, 3)."""
+    """Return whether all beams at stow are clear of a ball for sun vectors (S, 3)."""
     (middle, radius), (vertex, direction) = ball, stow_beams(places, suns)
     along = ((np.array(middle) - vertex) * direction).sum(axis=-1, keepdims=True)
     miss = np.linalg.norm(np.array(middle) - vertex - np.maximum(along, 0.0) * direction, axis=-1)
@@ -119,7 +119,7 @@ def _clear_at_stow(places: Sequence[tuple[float, float]], suns: FloatArray, ball
 
 
 def _beside(place: tuple[float, float]) -> float:
-    """Return how far a beam from a place through the standby point passes the receiver, m."""
+    """Return how far from the receiver a beam through the standby point passes, m."""
     direction = np.subtract(STANDBY, (*place, 2.0))
     goal = np.subtract(RECEIVER, (*place, 2.0))
     return float(np.linalg.norm(goal - direction * (goal @ direction) / (direction @ direction)))
@@ -140,9 +140,9 @@ def _when(chance: random.Random, seconds: float) -> tuple[Site, datetime]:
 def _limit(chance: random.Random, seconds: float) -> tuple[Site, datetime]:
     """Return a site and a time after which the sun crosses an elevation limit, and stays up.
 
-    In the evening the sun falls below the limit late enough for the field to be up before. In the
-    morning it starts below the limit, and rises above the upper limit well before the end of the
-    run; short runs have evenings only.
+    In the evening the sun falls below the limit late enough for the field to be up by then. In the
+    morning the sun starts below the limit, and rises above the upper limit well before the end of
+    the run; short runs have evenings only.
     """
     while True:
         site, midnight = _when(chance, 0.0)
@@ -165,11 +165,11 @@ def _limit(chance: random.Random, seconds: float) -> tuple[Site, datetime]:
 
 
 def _short_day(chance: random.Random, seconds: float) -> tuple[Site, datetime, float]:
-    """Return a site, a time and the elevation, rad, above which the sun then stays for a short day.
+    """Return a site, a time, and the sun elevation, rad, that limits a short day from then on.
 
     If the sun crosses the zenith, its elevation changes by one degree in four minutes, so that a
     whole day of the field passes in less than an hour. One day in five begins below the limit, and
-    the field waits in stow until the sun is high enough.
+    the field waits at stow until the sun is high enough.
     """
     noon = datetime(2026, 1, 1, 12, tzinfo=UTC) + timedelta(days=chance.randrange(365))
     declination = math.degrees(math.asin(float(vector(noon.timestamp(), Site(90.0, 0.0, 0.0))[2])))
@@ -189,7 +189,7 @@ def _short_day(chance: random.Random, seconds: float) -> tuple[Site, datetime, f
 
 
 def _ball(chance: random.Random, places: Sequence[tuple[float, float]], suns: FloatArray) -> Ball:
-    """Return a ball across an ordinary beam path, clear of mirrors, receiver and beams at stow."""
+    """Return a ball on an ordinary beam path, clear of mirrors, receiver and beams at stow."""
     while True:
         radius = chance.uniform(1.0, 5.0)
         east, north = chance.choice(list(places))

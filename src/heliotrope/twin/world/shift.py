@@ -1,8 +1,9 @@
 """Operators alongside automatic control: they give it the field, and interrupt it occasionally.
 
-They are rarely on duty. They give heliostats back, withdraw emergencies, and let automatic control
-resume after a loss. Occasionally they take the command authority for a while, send a heliostat to
-stow, take one out of service, or order an emergency in the middle of a visit.
+The operators are rarely on duty. They give heliostats back to automatic control, withdraw
+emergencies, and let automatic control resume after a loss. Occasionally they take the command
+authority for a while, send a heliostat to stow, take one out of service, or order an emergency in
+the middle of a visit.
 """
 
 import asyncio
@@ -30,7 +31,7 @@ _EMERGENCY = 12.0
 
 @dataclass(frozen=True)
 class Working:
-    """Automatic control of a run, its operators, and the observers of its work."""
+    """Automatic control in a run, with its operators and the observers of its work."""
 
     control: Work
     shift: "Shift | Crew"
@@ -49,7 +50,8 @@ class Working:
         """Judge the work; see the observers.
 
         ``quiet`` is None if a cluster is wrong from the start, because its heliostats may then do
-        nothing, and its reports concern other heliostats. ``waits``: the plant's program is frozen.
+        nothing, and its reports concern other heliostats. ``waits`` means that the plant program is
+        frozen.
         """
         watch, operations = self.watch, None if waits else self.control.operations
         watch.visits.look(plant, sun, now)

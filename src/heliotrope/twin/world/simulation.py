@@ -1,6 +1,6 @@
 """Deterministic simulation: a real plant, clusters and nodes in virtual time, with faults.
 
-A seed and a length define a run. The seed determines the heliostats and clusters, the actions of
+A seed and a duration define a run. The seed determines the heliostats and clusters, the actions of
 operators, the list of faults, the drift of the clocks, and the order in which the event loop runs
 ready callbacks. The same seed yields the same run, so one command replays a violated invariant
 (`RunResult.command`). The observers (`twin.invariants`) check every step.
@@ -142,19 +142,19 @@ class RunPlan:
     seed
         Seed of every random choice.
     seconds
-        Length in simulated time.
+        Duration in simulated time, s.
     heliostats
         Number of heliostats, 1 to 32; the seed puts them on one bus or on two.
     pause
         Mean time between faults, s.
     only
-        Kinds of faults to draw from, () for all.
+        Kinds of faults to draw from; () for all.
     faults
-        Faults of the run; None: drawn from the seed.
+        Faults of the run; None if they are drawn from the seed.
     worlds
         Names of `WORLDS` that this run adds to the usual environment.
     acts
-        Actions of the crew in a day ("days"); None: drawn from the seed.
+        Actions of the crew on a day ("days"); None if they are drawn from the seed.
 
     Raises
     ------
@@ -185,12 +185,12 @@ class RunPlan:
 
     @property
     def size(self) -> int:
-        """Number of heliostats: enough for a joint visit, if there are joint visits."""
+        """Number of heliostats, large enough for a joint visit if there are joint visits."""
         return max(self.heliostats, PARTY) if joint_visits(self.worlds) else self.heliostats
 
     @property
     def clusters(self) -> int:
-        """Number of clusters: two for every third seed."""
+        """Number of clusters, which is two for every third seed."""
         return 2 if self.seed % 3 == 2 and self.size > 1 else 1
 
     @property
@@ -221,7 +221,7 @@ class RunResult:
     plan
         Definition of the run.
     violation
-        The first violated invariant, or None.
+        The first violated invariant; None if none was violated.
     problem
         An exception from the code under test; empty if there was none.
     checks
@@ -229,11 +229,11 @@ class RunResult:
     faults
         Number of faults of each kind.
     counts
-        Number of actions by operators, and of messages to the plant.
+        Numbers of operator actions and of messages to the plant.
     states
         Number of times each state was entered.
     seconds
-        Simulated time.
+        Simulated time, s.
     """
 
     plan: RunPlan
@@ -247,7 +247,7 @@ class RunResult:
 
     @property
     def good(self) -> bool:
-        """Whether no invariant was violated and nothing failed."""
+        """Whether no invariant was violated and no program failed."""
         return self.violation is None and not self.problem
 
     @property
@@ -277,7 +277,7 @@ class Simulation:
     plan
         Definition of the run.
     loop
-        Its virtual time is true time.
+        Event loop whose virtual time is true time.
 
     Attributes
     ----------
@@ -359,7 +359,7 @@ class Simulation:
         self.instruments = Instruments(self._clock, plan.seed, self._flux, self.readings)
 
     def _employ(self) -> None:
-        """Let operators, automatic control and the tour work at the plant, before its observer."""
+        """Create the operators, automatic control and the tour, and the plant's observer."""
         plan = self.plan
         observers = [pod.observer for pod in self.pods]
         self.observer = PlantObserver(
@@ -392,7 +392,7 @@ class Simulation:
             pod.plant = self.observer
 
     def _quiet_observer(self) -> QuietObserver | None:
-        """Return the observer of work; None if initial errors hinder the work."""
+        """Return the observer of work; None if errors from the start hinder the work."""
         if not set(_WRONG).isdisjoint(self.plan.worlds):
             return None
         observers = {pod.name: pod.observer for pod in self.pods}
@@ -509,7 +509,7 @@ class Simulation:
     # -- the plant -------------------------------------------------------------------------
 
     def start_plant(self, group: asyncio.TaskGroup) -> None:
-        """Start the plant program; only the disk and the desired parameters are carried over."""
+        """Start the plant program, which inherits only the disk and the desired parameters."""
         links = {}
         for pod in self.pods:
             seed = self._chance.getrandbits(31)
@@ -546,7 +546,7 @@ class Simulation:
         entropy: Callable[[int], bytes],
         settings: PlantSettings = SETTINGS,
     ) -> PlantController:
-        """Return a new program of the plant."""
+        """Return a new plant program."""
         return PlantController(
             self._design,
             links,
@@ -593,9 +593,9 @@ class Simulation:
             await asyncio.sleep(2.0)
 
     def edit_plant_file(self, fault: Fault) -> None:
-        """Write another stow position of a heliostat into the plant file: near, or on the receiver.
+        """Write another stow position into the plant file: nearby, or lighting the receiver.
 
-        The plant must not send the latter, because the beam of the stowed heliostat would be on the
+        The plant must not send the second kind, because the stowed heliostat's beam would be on the
         receiver.
         """
         fit = self._fits[fault.target]
@@ -609,7 +609,7 @@ class Simulation:
         self._stows = {fit.name: packed("stow", (int(stow[0]), int(stow[1])))}
 
     def _read_plant_file(self) -> None:
-        """Require the stow positions of the plant file, which the next program finds corrected."""
+        """Require the plant file's stow positions; the next program finds the file corrected."""
         for fit in self._fits:
             self._wanted.set(fit.name, {"stow": self._stows.get(fit.name, fit.items["stow"])})
         self._stows = {}
@@ -648,7 +648,7 @@ class Simulation:
             each.on_alarm(alarm, self._clock.monotonic())
 
     def crash_plant(self, now: float) -> None:
-        """Kill the plant program wherever it is; the clusters see their connections close."""
+        """Kill the plant program at whatever point it is; the clusters lose their connections."""
         for pod in self.pods:
             if pod.ear is not None:
                 pod.ear.end()
@@ -676,7 +676,7 @@ class Simulation:
     def hang_plant(self, now: float, *, silent: bool, frozen: bool) -> None:
         """Silence the plant program, freeze it, or let it continue.
 
-        A silenced program continues without its lines; in a frozen program nothing runs, and the
+        A silenced program continues without its lines. In a frozen program nothing runs, and the
         operators wait.
         """
         runs = self.plant is not None
@@ -735,7 +735,7 @@ class Simulation:
         await (self.operator if self._tour is None else self._tour).work()
 
     async def _turn(self, damage: Damage, group: asyncio.TaskGroup) -> None:
-        """Advance boards, faults and observers to the end."""
+        """Advance boards, faults and observers until the end."""
         end, judged = self.begin + self.plan.seconds, self.begin
         while (now := self._clock.monotonic()) < end:
             # A fault that ends now has had an effect until now.
@@ -820,14 +820,14 @@ def run(plan: RunPlan) -> RunResult:
 
 
 def _lost(about: dict[str, Any], outcome: RunResult) -> None:
-    """Note an exception of a task or of a callback that was not awaited."""
+    """Record an exception of a task or of a callback that nobody awaited."""
     error = about.get("exception")
     if isinstance(error, Exception) and not outcome.problem:
         outcome.problem = f"{about['message']}: {type(error).__name__}: {error}"
 
 
 def _blame(error: BaseException, outcome: RunResult) -> None:
-    """Return the first failure among all exceptions of a task group."""
+    """Return the first failure among all exceptions in a task group."""
     errors = list(_leaves(error))
     for leaf in errors:
         if isinstance(leaf, InvariantError):

@@ -1,4 +1,4 @@
-"""Many runs: over several processes, within a time limit, resumed where the last one stopped."""
+"""Many runs: in several processes, within a time limit, resumed where the last batch stopped."""
 
 import json
 from collections import Counter
@@ -50,7 +50,7 @@ class SoakResult:
 
 
 def summary(outcome: RunResult) -> dict[str, Any]:
-    """Return a run as plain JSON."""
+    """Return the summary of a run as plain JSON."""
     return {
         "seed": outcome.plan.seed,
         "seconds": outcome.seconds,
@@ -88,16 +88,16 @@ def run_many(
     progress
         File with one line per run; runs already in the file are skipped.
     tell
-        Called after each run.
+        Function that is called after each run.
     clock
-        Clock of the time limit; None: the system's.
+        Clock of the time limit; None for the system clock.
 
     Raises
     ------
     InputError
         If there is less than one process.
     FormatError
-        If the progress file is not one of such runs.
+        If the progress file does not contain such runs.
     """
     if processes < 1:
         raise InputError(f"a soak needs 1 process or more, not {processes}")

@@ -20,21 +20,21 @@ EVERY = 40.0
 
 
 class PlantStore:
-    """A store that outlives the plant's program, and may be exchanged for a backup of it.
+    """A store that outlives the plant program and may be replaced by one of its backups.
 
     Parameters
     ----------
     clock
-        Of the plant.
+        Clock of the plant.
     persons
         Observer that knows what operators had ordered and locked at the time of each backup.
     exits
-        Removes it at the end of the run.
+        Removes the store at the end of the run.
 
     Attributes
     ----------
     keeper, points
-        The store, and the assigned points in it.
+        The store, and the assigned points that it contains.
     """
 
     def __init__(self, clock: Clock, persons: PersonsObserver, exits: contextlib.ExitStack) -> None:
@@ -50,7 +50,7 @@ class PlantStore:
         self.keeper.close()
 
     def service(self, plant: PlantController, tell: Callable[[Alarm], None]) -> Service:
-        """Return the locks of operators on a new program's heliostats."""
+        """Return the operators' locks for the heliostats of a new program."""
         keeping = Keeping(plant.field.names, plant.beliefs, self.keeper)
         return Service(plant, keeping, tell)
 

@@ -1,10 +1,11 @@
 """The environment "tour": nothing fails, and an engineer takes each heliostat through all commands.
 
 Observers of faults cannot find errors in a field that does nothing. Here each command must be
-carried out: it is accepted and done in time, the board is in the requested state, the plant shows
-it, and no alarm is raised. A state is only a name, so the true heliostat is checked too: its beam
-is on the specified point (12), and its motors have moved as commanded. At the end a field-wide
-emergency defocuses the field, is confirmed, and the field comes back.
+carried out: it is accepted and done in time, the board reaches the requested state, the plant
+displays that state, and no alarm is raised. A state is only a name, so the true heliostat is
+checked too: its beam is on the specified point (invariant 12), and its motors have moved as
+commanded. At the end an emergency defocuses the field and is confirmed, and the field returns to
+work.
 """
 
 import asyncio
@@ -66,13 +67,13 @@ class Tour:
     Parameters
     ----------
     operator
-        Issues the commands.
+        Operator who issues the commands.
     boards
         The heliostats.
     clock
-        True time.
+        Clock that shows true time.
     sun
-        Returns the true direction to the sun, (3,), at a time in s.
+        Function that returns the true direction to the sun, (3,), at a time in s.
     seed
         Seed of the pauses and of the jogs.
 
@@ -97,7 +98,7 @@ class Tour:
         self.over = False
 
     async def work(self) -> None:
-        """Take all heliostats through the tour, then raise an emergency; return when it is over.
+        """Take all heliostats through the tour, then through an emergency; return at the end.
 
         Raises
         ------
@@ -136,7 +137,7 @@ class Tour:
         await self._done("TRACK", name, "TRACKING")
 
     async def _done(self, what: str, name: str, state: str) -> None:
-        """Issue a command, and check that it is carried out and shown."""
+        """Issue a command, and check that it is carried out and displayed."""
         board, jog = self._boards[name], [0, 0]
         jog[self._chance.randrange(2)] = self._chance.choice([-JOGGED, JOGGED])
         before = _turned(board)
@@ -166,7 +167,7 @@ class Tour:
             await self._stands(name)
 
     def _ordered(self, what: str, name: str, jog: Sequence[int]) -> Ticket | None:
-        """Issue a command; return None if it is refused."""
+        """Issue a command and return its ticket; return None if the command is refused."""
         if what in ("DEFOCUS", "STOW"):
             return self._operator.safe(self._plant, what, name)
         if what == "PARAMETERS":
@@ -177,7 +178,7 @@ class Tour:
         return self._operator.give(self._plant, what, (name,), values=values)
 
     async def _searched(self, name: str) -> None:
-        """Check that the beam follows the spiral, to its last turn and no further."""
+        """Check that the beam follows the spiral to its last turn, and no further."""
         board, point = self._boards[name], self._operator.points["AIM", name]
         far, most = _far(board, point), 0.0
         until = self._clock.monotonic() + SPIRAL_TAKES
@@ -204,7 +205,7 @@ class Tour:
         self._check(row.state == state, f"{what} {name}: {state}, and the plant shows {row.state}")
 
     def _beam(self, what: str, name: str) -> None:
-        """Check where the true beam is, or that the true heliostat is at stow."""
+        """Check that the true beam is at its point, or that the true heliostat is at stow."""
         board, points = self._boards[name], self._operator.points
         if board.state == states.STOWED:
             off = int(np.abs(_turned(board) - board.outfit.stow).max())
@@ -224,7 +225,7 @@ class Tour:
         return board.miss(self._sun(self._clock.monotonic()), (point[0], point[1], point[2]))
 
     async def _emergency(self) -> None:
-        """Defocus the whole field, and bring it back."""
+        """Defocus the whole field with an emergency, and bring it back."""
         order = self._operator.raises(self._plant, VIEWER, Act.DEFOCUS)
         good = await order.ticket.end(OFF_WITHIN)
         self._check(good, f"an emergency is not carried out: {order.ticket.text}")

@@ -1,7 +1,7 @@
 """A second plant with the same keys: a backup that is started while the first plant runs.
 
-It has the records, points and parameters of the time at which it is started, its own operators, and
-the same lines, for which the two plants compete.
+The second plant has the records, points and parameters of the time at which it is started, its own
+operators, and the same lines, for which the two plants compete.
 """
 
 import asyncio
@@ -37,17 +37,18 @@ class SecondPlant:
     Parameters
     ----------
     clock, seed
-        True time; seed of all random choices.
+        Clock that shows true time; seed of all random choices.
     wanted, assigned
         Parameters and points of the first plant, copied at each start.
     pods
-        The clusters, whose lines it takes.
+        The clusters whose lines the second plant takes over.
     observers
-        Creates the observers of a plant with records on a disk.
+        Function that creates the observers of a plant with records on a disk.
     people
-        Creates the operators of a plant.
+        Function that creates the operators of a plant.
     begins
-        Creates the plant program from its links, its stores, and a source of random bytes.
+        Function that creates the plant program from its links, its stores, and a source of random
+        bytes.
 
     Attributes
     ----------
@@ -56,7 +57,7 @@ class SecondPlant:
     operator
         Its operators.
     plant
-        The plant; None while it does not run.
+        The plant; None while it is not running.
     """
 
     def __init__(
@@ -80,7 +81,7 @@ class SecondPlant:
         self._program: list[asyncio.Task[None]] = []
 
     async def work(self) -> None:
-        """Let its operators raise heliostats, one at a time."""
+        """Let the second plant's operators raise heliostats one at a time."""
         while True:
             await asyncio.sleep(self._chance.expovariate(1.0 / _PAUSE))
             if self.plant is not None:
@@ -88,7 +89,7 @@ class SecondPlant:
                 self.operator.onward(self.plant)
 
     def turn(self, group: asyncio.TaskGroup, *, on: bool) -> None:
-        """Start its program, or kill it."""
+        """Start the second plant's program, or kill it."""
         if on and self.plant is None:
             self._start(group)
         elif not on and self.plant is not None:

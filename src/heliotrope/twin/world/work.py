@@ -53,14 +53,14 @@ class WorkKind:
     Attributes
     ----------
     lies
-        Fraction of the photographs with which lies begin.
+        Fraction of the photographs at which false light begins.
     searches
         Fraction of the runs whose visits search for the beam and follow it, so that a stationary
         light is never taken for the beam.
     lights
         Whether lights stay on the targets for minutes.
     together
-        Whether the plant chooses by its own schedule, and measures several heliostats at once.
+        Whether the plant chooses heliostats by its own schedule, and measures several at once.
     lowest
         Elevation of the sun below which the field is stowed, rad.
     """
@@ -79,7 +79,7 @@ DAY_WORK = WorkKind(0.02)
 
 
 class _Rounds:
-    """The schedule of a short run: whichever ready heliostat has waited longest."""
+    """The schedule of a short run: the ready heliostat that has waited longest is next."""
 
     def __init__(self, names: Sequence[str], clock: Clock) -> None:
         self._names, self._clock = names, clock
@@ -115,30 +115,30 @@ class _Rounds:
 
 
 class Work:
-    """Automatic control of a run, created again whenever the plant's program starts.
+    """Automatic control in a run, which is recreated whenever the plant program starts.
 
     Parameters
     ----------
     seed
         Seed of the camera, and of the kind of visits.
     sight
-        True mirrors and sun.
+        The true mirrors and the sun.
     exits
         Closes the store at the end of the run.
     kind
-        How it works.
+        How automatic control works.
 
     Attributes
     ----------
     centred
-        Whether visits search for the beam and follow it; otherwise they photograph whatever is
-        there.
+        Whether visits search for the beam and follow it; otherwise they photograph whatever light
+        is there.
     camera
         Camera of the targets.
     records
         The store.
     operations, logbook
-        Those of the plant's program; None while it does not run.
+        Operations and logbook of the plant program; None while it is not running.
     """
 
     def __init__(
@@ -163,18 +163,21 @@ class Work:
         self.logbook: Logbook | None = None
 
     def away(self, at: float) -> float:
-        """Return the time from a POSIX time, s, to the nearest photograph, s."""
+        """Return the difference between a POSIX time, s, and the nearest photograph's time, s."""
         zero = self._clock.utc().timestamp() - self._clock.monotonic()
         return self.camera.away(at - zero)
 
     def opens(self, on_alarm: Callable[[Alarm], None]) -> Logbook:
-        """Return the logbook of a new program, which reports all alarms that begin or end."""
+        """Return the logbook of a new program, which records every alarm that begins or ends."""
         self.logbook = Logbook(self._clock, self.records)
         self.logbook.forward = on_alarm
         return self.logbook
 
     def begins(self, plant: PlantController) -> Operations:
-        """Return the operations of a new program; local controllers should store its parameters."""
+        """Return the operations of a new program.
+
+        Local controllers should store the program's parameters.
+        """
         assert self.logbook is not None
         centring = SEARCH if self.centred else None
         cycle = CalibrationCycle(plant, self.camera, VISIT, centring)
@@ -213,7 +216,7 @@ class Work:
             self.logbook.take_alarm(alarm)
 
     def ends(self) -> None:
-        """Record that the program ends, at whatever point it is."""
+        """Record that the program has ended, at whatever point it was."""
         if self.operations is not None:
             self.operations.automatic.stop()
         self.operations = self.logbook = None

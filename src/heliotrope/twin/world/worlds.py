@@ -1,4 +1,4 @@
-"""Environments (worlds): additions to the usual one, by name, and initial errors."""
+"""Environments (worlds) that a run adds to the usual environment, and initial errors."""
 
 import random
 from collections.abc import Mapping, Sequence
@@ -75,7 +75,7 @@ ALONE_SHARE = 0.1
 
 
 def checked(worlds: Sequence[str]) -> None:
-    """Check the names of worlds.
+    """Check that the names of worlds are known.
 
     Raises
     ------
@@ -88,7 +88,10 @@ def checked(worlds: Sequence[str]) -> None:
 
 
 def mixed(seed: int) -> tuple[str, ...]:
-    """Return worlds drawn from a seed: some of `MIX`, and rarely one of `RARE`; or only one."""
+    """Return worlds drawn from a seed.
+
+    These are some of `MIX`, rarely with a world of `RARE`, or a single world.
+    """
     for alone in (DAYS, REPAIRS):
         if random.Random(f"{alone} {seed}").random() < ALONE_SHARE:
             return (alone,)
@@ -115,16 +118,16 @@ class Habits:
     pause
         Mean time between two actions, s.
     weights
-        Weights of their actions: advance a heliostat, command all, push parameters, raise an
-        emergency, order one heliostat off, lock one, command without authority, change the
-        authority, aim at a keep-out volume.
+        Weights of the operators' actions: advance a heliostat, command all heliostats, push
+        parameters, call an emergency, order one heliostat off, lock one, issue a command without
+        authority, hand over the authority, aim at a keep-out volume.
     idle
-        Whether they order IDLE for all heliostats; those at stow then stay in IDLE.
+        Whether the operators order IDLE for all heliostats; heliostats at stow then stay in IDLE.
     calibrates
         Fraction of the actions that change parameters, in addition to those of every run.
     locks
-        Fraction of their actions that lock a heliostat, remove a lock, write to a locked heliostat,
-        or repair a board.
+        Fraction of the operators' actions that lock a heliostat, remove a lock, write to a locked
+        heliostat, or repair a board.
     """
 
     pause: float = 2.0
@@ -135,7 +138,7 @@ class Habits:
 
     @classmethod
     def of(cls, worlds: Sequence[str], seed: int) -> "Habits":
-        """Return the habits of a run."""
+        """Return the operators' habits in a run."""
         if REPAIRS in worlds:
             calm = "calm" in worlds
             return cls(2.0, _REPAIRING_CALMLY if calm else _REPAIRING, locks=0.02 if calm else 0.5)
@@ -173,44 +176,47 @@ def pause_of(worlds: Sequence[str], seed: int, pause: float) -> float:
 
 
 def works(worlds: Sequence[str]) -> bool:
-    """Whether automatic control runs in a run."""
+    """Return whether automatic control works in a run."""
     return not set(worlds).isdisjoint(WORKING)
 
 
 def joint_visits(worlds: Sequence[str]) -> bool:
-    """Whether several heliostats are measured at once in a run."""
+    """Return whether several heliostats are measured at once in a run."""
     return not set(worlds).isdisjoint(PARTIES)
 
 
 def measured(worlds: Sequence[str]) -> bool:
-    """Whether sensors of wind and flux feed the plant of a run."""
+    """Return whether wind and flux sensors supply a run's plant with readings."""
     return not {"sensors", DAYS}.isdisjoint(worlds)
 
 
 def length_of(worlds: Sequence[str], hours: float | None) -> float:
-    """Return the length of a run, s: ``hours`` if given, else a day for "days", else 0.1 h."""
+    """Return the duration of a run, s.
+
+    It is ``hours`` if specified, otherwise a day for "days" and 0.1 h for all other worlds.
+    """
     if hours is not None:
         return 3600.0 * hours
     return DAY if DAYS in worlds else 360.0
 
 
 def drawn(worlds: Sequence[str]) -> bool:
-    """Whether site, date, hour, and places are drawn in a run."""
+    """Return whether the site, date, hour and heliostat positions of a run are drawn at random."""
     return not set(worlds).isdisjoint(DRAWN)
 
 
 def knows_boards(worlds: Sequence[str]) -> bool:
-    """Whether the plant of a run knows what every board should store, as a real one does."""
+    """Return whether a run's plant knows what every board should store, as a real plant does."""
     return works(worlds) or not {"parameters", "calibrations", REPAIRS}.isdisjoint(worlds)
 
 
 def stored_by(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
     """Return heliostats with the items that their boards store at the start.
 
-    In the world "parameters" half of them store wrong items: those of another heliostat, or their
-    own with a small to gross error, or limits that are too narrow. If addresses are swapped, none
-    stores those of another heliostat, because a board with the address and the armature of another
-    heliostat is indistinguishable from that heliostat's board, except by a photograph.
+    In the world "parameters" half of the boards store wrong items: another heliostat's items, their
+    own items with a small to gross error, or limits that are too narrow. If addresses are swapped,
+    no board stores another heliostat's items, because a board with the address and the armature of
+    another heliostat is indistinguishable from that heliostat's board, except by a photograph.
     """
     if "parameters" not in worlds:
         return list(fits)
@@ -225,7 +231,7 @@ def stored_by(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[
 
 
 def motors_of(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
-    """Return heliostats with their motors, which step coarsely on one day in three."""
+    """Return heliostats with their motors, which make coarse steps on one day in three."""
     coarse = DAYS in worlds and random.Random(f"motors {seed}").random() < _COARSE_DAYS
     if not coarse:
         return list(fits)
@@ -241,9 +247,10 @@ def motors_of(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[
 
 
 def surveyed(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
-    """Return heliostats as in the plant file; on one day in three it is wrong about three.
+    """Return heliostats as the plant file has them, with three wrong on one day in three.
 
-    From 80 m, their beams then miss the targets, so that no photograph shows them.
+    At 80 m and beyond, the beams of the wrong heliostats miss the targets, so that no photograph
+    shows them.
     """
     chance = random.Random(f"survey {seed}")
     if DAYS not in worlds or chance.random() >= _UNSURVEYED:
@@ -259,7 +266,7 @@ def surveyed(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[O
 
 
 def covered_by(names: Sequence[str], worlds: Sequence[str], seed: int) -> frozenset[str]:
-    """Return the heliostats whose mirrors are covered: one, on one day in four."""
+    """Return the heliostats with covered mirrors: one heliostat on one day in four."""
     chance = random.Random(f"covers {seed}")
     if DAYS not in worlds or chance.random() >= _COVERED:
         return frozenset()
@@ -267,7 +274,7 @@ def covered_by(names: Sequence[str], worlds: Sequence[str], seed: int) -> frozen
 
 
 def wrong_items(fit: Outfit, others: Sequence[Outfit], chance: random.Random) -> dict[str, bytes]:
-    """Return some wrong items of a heliostat, or another heliostat's location and armature."""
+    """Return wrong items for a heliostat, or another heliostat's position and armature."""
     what = chance.choice([*(["another"] if others else []), "armature", "biases", "machine"])
     if what == "another":
         other = items_of(chance.choice(list(others)).mechanism)
@@ -282,7 +289,7 @@ def wrong_items(fit: Outfit, others: Sequence[Outfit], chance: random.Random) ->
 
 
 def narrow_limits() -> dict[str, bytes]:
-    """Return the items of axes that move less and slower than those of `MACHINE`."""
+    """Return items that give the axes a smaller range and speed than `MACHINE` does."""
     axes = tuple(
         replace(axis, low=axis.low + 1000, high=axis.high - 1000, rate=axis.rate // 2)
         for axis in MACHINE.axes
@@ -297,7 +304,7 @@ def narrow_limits() -> dict[str, bytes]:
 
 
 def common_error(worlds: Sequence[str], seed: int) -> timedelta:
-    """Return how far the common time of plant and clusters is ahead of the true time."""
+    """Return by how much the time shared by plant and clusters is ahead of true time, s."""
     if COMMON not in worlds:
         return timedelta()
     chance = random.Random(f"{COMMON} {seed}")
@@ -305,7 +312,7 @@ def common_error(worlds: Sequence[str], seed: int) -> timedelta:
 
 
 class PodErrors:
-    """The errors of one cluster from the start.
+    """The errors that one cluster has from the start.
 
     Parameters
     ----------
@@ -314,14 +321,14 @@ class PodErrors:
     seed
         Seed of the run.
     index
-        Number of the cluster.
+        Index of the cluster.
 
     Attributes
     ----------
     freezes
-        Whether its program may be frozen.
+        Whether the cluster program may be frozen.
     shared
-        Whether a second plant occasionally takes its line.
+        Whether a second plant occasionally takes over the cluster's line.
     """
 
     def __init__(self, worlds: Sequence[str], seed: int, index: int) -> None:
