@@ -215,7 +215,7 @@ class _Step:
 
 
 def turned_back(flights: Sightings, mechanism: Mechanism, turn: FloatArray) -> Sightings:
-    """Return sightings without their mirrors' rotation, by rotating the rays about the vertices.
+    """Return sightings corrected for their mirrors' rotation, by rotating rays about the vertices.
 
     Parameters
     ----------

@@ -57,7 +57,7 @@ def _segment(residual, jacobian, start, stop, shift):
 
 @njit(**OPTIONS)
 def partition(residual, jacobian, places, smallest):
-    """Best partition of sightings (n, 2) with cuts at ``places``; labels (n,), 0: common zeros."""
+    """Return labels (n,) of the best partition of sightings (n, 2), with cuts at ``places``."""
     n, count = len(residual), len(places)
     plain = np.zeros(n + 1)
     for i in range(n):
