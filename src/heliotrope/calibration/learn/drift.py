@@ -5,11 +5,11 @@ The parameters of a heliostat at time t are
 $$ x_p(t) = μ_p + s_p + ρ_p[\text{regime}(t)] + \sum_c d_{pc}(t) $$
 
 where μ is the mean of the field, s the deviation of the heliostat (variance τ², learnt from the
-field), ρ an offset of the two zeros in each regime and after each step, and d Ornstein-Uhlenbeck
-processes: the zeros creep over months (*slow*) and optionally over *weeks*, and the mirror normal
-moves within *hours* (temperature, wind, direction of approach). The model is linear in x and
-Gaussian, so everything follows in closed form (Rasmussen & Williams 2006, Gaussian Processes for
-Machine Learning, (2.23)-(2.24), (5.8)-(5.12)).
+field), ρ an offset of the two drive zeros in each regime and after each step, and d
+Ornstein-Uhlenbeck processes: the drive zeros creep over months (*slow*) and optionally over
+*weeks*, and the mirror normal moves within *hours* (temperature, wind, direction of approach). The
+model is linear in x and Gaussian, so everything follows in closed form (Rasmussen & Williams 2006,
+Gaussian Processes for Machine Learning, (2.23)-(2.24), (5.8)-(5.12)).
 """
 
 from collections.abc import Sequence
@@ -29,26 +29,26 @@ from heliotrope.parallel import run_blocks
 DAY = 86400.0
 #: Names of the time scales of the processes.
 GROUPS = ("slow", "weeks", "hours")
-#: Starting values of the search, and the standard deviation of their logarithms.
+#: Starting values of the search, and the prior standard deviation of their logarithms.
 START_DAYS = {"slow": 300.0, "weeks": 5.0, "hours": 0.1}
 START_RAD = {"slow": 1e-3, "weeks": 1e-3, "hours": 2.5e-4}
 START_NOISE = 0.5
 STRAY = 0.7
-#: Standard deviation of one heliostat's own logarithms about the field's; half of this for time
+#: Standard deviation of one heliostat's logarithms about those of the field; half as much for time
 #: constants.
 OWN_STRAY = 0.4
-#: Minimum number of sightings for finding outliers.
+#: Minimum number of sightings needed to find outliers.
 FEWEST = 4
-#: Share of the heliostats from which the hyperparameters are learnt.
+#: Fraction of the heliostats from which the hyperparameters are learnt.
 TYPICAL = 0.85
-#: Factor on the table's prior if the fit needed a far start.
+#: The prior from the table is widened by this factor if the fit needed a far start.
 WIDE = 10.0
 #: Standard deviation of a zero after a re-reference or repair, rad.
 REGIME_RAD = 0.020
-#: Standard deviation of a step, rad: a jack that slipped, a limit switch that moved.
+#: Standard deviation of a step, rad, such as a slipped jack or a displaced limit switch.
 STEP_RAD = 0.001
-#: Gain in log evidence that a step needs beyond the logarithm of the number of positions tried, and
-#: the minimum number of sightings before and after it.
+#: Gain in log evidence that a step must bring, beyond the logarithm of the number of positions
+#: tried, and the minimum number of sightings before and after the step.
 STEP_GAIN, AFTER_STEP = 4.0, 3
 #: Minimum time between two sightings with a step between them, days.
 STEP_GAP = 1.0 / 24.0
@@ -76,8 +76,8 @@ def zeros(mechanism: Mechanism) -> tuple[str, ...]:
 def default_processes(mechanism: Mechanism) -> tuple[Process, ...]:
     """Return the usual processes of a kind of mechanism: creep of the zeros, motion of the normal.
 
-    A process over weeks is possible too; on the measurements of Jülich it improves nothing
-    beyond the steps.
+    A process over weeks is possible too, but for the Jülich measurements it adds nothing to what
+    the steps explain.
     """
     processes = [Process(name, "slow") for name in zeros(mechanism)]
     normal = [n for n in ("canting", "canting_secondary") if n in mechanism.parameters]
@@ -102,13 +102,13 @@ class Hyperparameters:
     step
         Standard deviation of a step of the zeros, (P,).
     wide
-        Standard deviation of a constant whose nominal value turned out to be wrong, (P,).
+        Standard deviation of the constant part if its nominal value turned out to be wrong, (P,).
     amplitude
         Standard deviation of each process, (C,).
     tau
         Time constants of the time scales in use, days, (G,).
     noise
-        Noise of a sighting, in units of the sighting's sigma.
+        Noise of a sighting, in units of its stated sigma.
     rate
         Steps per day.
     heavy

@@ -92,7 +92,7 @@ def defaults(mechanism: Mechanism, model: tuple[str, ...]) -> Hyperparameters:
 
 
 def able(histories: Sequence[Sightings | None]) -> npt.NDArray[np.intp]:
-    """Return the indices of heliostats with enough sightings to learn from, on at least two days."""
+    """Return the indices of heliostats with enough sightings to learn from, on two days or more."""
     rows = []
     for row, sightings in enumerate(histories):
         known = np.zeros(0) if sightings is None else sightings.time[np.isfinite(sightings.time)]

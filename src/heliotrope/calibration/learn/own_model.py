@@ -80,7 +80,7 @@ class OwnModel:
         group: Hyperparameters | None,
         flown: Sequence[Flown] = (),
     ) -> FieldFit:
-        """Return the fit that follows the drift, starting from a fit of constants; see `present`."""
+        """Return a fit that follows the drift, starting from a fit of constants; see `present`."""
         fitted = fitting_present(
             self.start(nominal), sightings, self._searched(constants), group, flown
         )
@@ -182,7 +182,7 @@ def _scored(
 def _left_out(
     mechanism: Mechanism, s: Sightings, names: tuple[str, ...], mean: FloatArray
 ) -> FloatArray:
-    """Return the log density of each visit given the others, (V,), at the noise that maximises it."""
+    """Return the log density of each visit given the others, (V,), at the best noise."""
     fitted = fit(mechanism, s, names)
     moved = mechanism.with_parameters(fitted.parameters)
     line = linearise(moved[s.heliostat], s, names)

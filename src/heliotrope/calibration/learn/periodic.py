@@ -168,7 +168,7 @@ class _Member:
         return np.asarray(self.whiten @ raw)
 
     def solved(self, drive: int, ratios: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the cosine and sine coefficients, (T, 2), and −ln P, (T,), of trial ratios (T,)."""
+        """Return the cosine and sine coefficients (T, 2) and −ln P (T,) of trial ratios (T,)."""
         waves = self.waves(drive, ratios)
         normal = np.swapaxes(waves, 1, 2) @ waves
         right = np.swapaxes(waves, 1, 2) @ self.rest
@@ -241,7 +241,7 @@ def _known_ratios(mechanism: Mechanism) -> dict[int, float]:
 
 
 def arguments(drives: Drive, counts: FloatArray) -> FloatArray:
-    """Return x of each drive at its counts: the ideal angle in rad, or the stroke of a jack in m."""
+    """Return x of each drive at its counts: the ideal angle, rad, or the stroke of a jack, m."""
     t = drives.table
     moved = t[..., slot.RATE] * counts
     return np.asarray(np.where(t[..., slot.KIND] == slot.LINEAR, moved, t[..., slot.ZERO] + moved))
@@ -303,7 +303,7 @@ def _whitened(
 
 
 def visit_means(mechanism: Mechanism, s: Sightings) -> FloatArray:
-    """Return the matrix (V, M) that averages M sightings of the heliostat at index 0 over visits."""
+    """Return the matrix (V, M) that averages M sightings of heliostat 0 over visits."""
     return _visit_means(s.time, arguments(Drive(mechanism.drives.table[s.heliostat]), s.counts))
 
 

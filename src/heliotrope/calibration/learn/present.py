@@ -81,7 +81,7 @@ def replayed(
     hyper
         Hyperparameters of the heliostat's group, for the same parameters.
     flown
-        Its measurements from flights.
+        The heliostat's measurements from flights.
     """
     count = len(fitted.names)
     values, centre = np.zeros(len(hyper.names)), np.zeros(len(hyper.names))
@@ -145,8 +145,7 @@ class _Rows:
     def of_flight(
         cls, moved: Mechanism, flown: Flown, hyper: Hyperparameters, off: FloatArray
     ) -> "_Rows":
-        """Return a flight's linearised sightings, scaled so that their noise is their stated
-        sigma."""
+        """Return a flight's linearised sightings, scaled so that their noise is their sigma."""
         sightings = flown.sightings
         placed = moved[sightings.heliostat]
         line = linearise(placed, sightings, hyper.names)
@@ -229,8 +228,7 @@ def _applied(group: Hyperparameters, own: Hyperparameters) -> Hyperparameters:
 
 
 def at_present(fitted: FieldFit, belief: Belief, time: float) -> FieldFit:
-    """Return a fit (1,) with the values and covariance of a belief, `AHEAD` days after a POSIX
-    time, s."""
+    """Return a fit (1,) with a belief's values and covariance `AHEAD` days after ``time``, s."""
     count = len(fitted.names)
     values, covariance = belief.at(time / DAY + AHEAD)
     return replace(fitted, values=values[None, :count], covariance=covariance[None, :count, :count])
@@ -256,7 +254,7 @@ def fitting_present(
     group
         Hyperparameters of the heliostat's group; default: none.
     flown
-        Its measurements from flights.
+        The heliostat's measurements from flights.
     """
     times = np.concatenate([sightings.time, *(flight.sightings.time for flight in flown)])
     known = times[np.isfinite(times)]
