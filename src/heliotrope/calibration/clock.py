@@ -144,7 +144,7 @@ class _Step:
 def _settled(
     mechanism: Mechanism, sightings: Sightings, model: tuple[str, ...], site: Site, shift: float
 ) -> _Step:
-    """Return the shift at which the sightings require no further shift, searching from ``shift``."""
+    """Return the shift at which the sightings need no further shift, searching from ``shift``."""
     for _ in range(ROUNDS):
         step = _step(mechanism, sightings, model, site, shift)
         done = abs(step.shift - shift) < 0.1 * step.sigma
@@ -234,7 +234,7 @@ def later(sightings: Sightings, site: Site, shift: float) -> Sightings:
 
 
 def _part(suns: Sightings, chosen: npt.NDArray[np.intp], most: int) -> Sightings:
-    """Return at most ``most`` sightings of each chosen heliostat, spread evenly over its sightings."""
+    """Return at most ``most`` sightings of each chosen heliostat, spread evenly over all."""
     rows, place = [], []
     for k, row in enumerate(chosen):
         mine = np.flatnonzero(suns.heliostat == row)

@@ -153,7 +153,7 @@ class TermFit(Value, Framed):
         )
 
     def without_terms(self, sightings: Sightings) -> Sightings:
-        """Return the sightings with the counts at which ``mechanism`` alone reaches the same poses."""
+        """Return sightings with the counts at which ``mechanism`` alone reaches the same poses."""
         sightings = self.original.rows_of(sightings)
         row = sightings.heliostat
         shapes = _shapes(self.terms, self.original.mechanism[row], sightings.counts)
