@@ -1,4 +1,4 @@
-r"""The orientation of mirrors from reflections of the drone's lamp.
+r"""Measure the orientation of mirrors from reflections of the drone's lamp.
 
 Each reflection measures one normal, the bisector of the directions to the lamp and the camera. The
 shape of the mirror determines the normal expected at that point. The small rotation ω, about the
@@ -7,12 +7,13 @@ concentrator's own x and y axes, from the expected normal n to the measured norm
 $$ ω = \frac{n × v}{|n × v|} \arcsin |n × v| $$
 
 The orientation is corrected by the mean of all ω, over the points or over the mirror area. Because
-the points move on the mirror with the orientation, this is done twice; then outliers are rejected
-(Rosner's test of each component), and the final mean is the result. The remaining ω at each point,
-its *angular difference*, contains all information on accuracy and on the facets.
+the points move on the mirror when the orientation changes, the correction is made twice. Then
+outliers are rejected (Rosner's test of each component), and the final mean is the result. The
+remaining ω at each point, its *angular difference*, contains all information on accuracy and on the
+facets.
 
-Two rounds, the test and a final mean are HelioPoint's procedure; the mean over the area is our own
-addition.
+The two rounds, the test and the final mean are HelioPoint's procedure; the mean over the area is
+our own addition.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -39,19 +40,21 @@ from heliotrope.airborne.visibility import FEWEST
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, azimuth_elevation, rotation
 
-#: Mean over the points: equal weights, or weights that represent the whole area.
+#: Kinds of mean over the points: with equal weights, or with weights that represent the whole area.
 Mean = Literal["plain", "area"]
 
-#: Rounds of mean and correction before the test for outliers.
+#: Number of rounds of mean and correction before the test for outliers.
 ROUNDS = 2
-# With as many well measured mirrors, the others are taken to scatter like them.
+# If at least this many mirrors are well measured, the rest are assumed to scatter like them.
 _ENOUGH_MIRRORS = 5
-# Distance of the points' centre from the mirror's that raises a warning, in half widths.
+# Distance between the centres of the points and of the mirror that causes a warning, in half
+# widths.
 _OFF_CENTRE = 0.25
-# A facet is canted off if its mean differs this many standard errors, and this much (rad).
+# The canting of a facet is off if its mean differs by this many standard errors, and by this angle,
+# rad.
 _CANTED_SIGMA, _CANTED = 4.0, 0.5e-3
-# p below which the differences are reported as not normal: HelioPoint's threshold. One good mirror
-# in ten fails it in one of its two components.
+# Below this p-value (HelioPoint's threshold) the differences are reported as not normal. One good
+# mirror in ten fails the test in one of its two components.
 _NORMAL = 0.05
 
 
@@ -64,8 +67,8 @@ class FacetMean:
     facet, count
         Facet index, and its number of points without outliers, unless most points are outliers.
     mean
-        Mean of the differences, rotX and rotY, rad, (2,): its canting error relative to the mean of
-        all; NaN without points.
+        Mean of the differences, rotX and rotY, rad, (2,), which is the facet's canting error
+        relative to the mean of all facets; NaN if the facet has no points.
     sigma
         Standard error of the mean, σ/√n, rad, (2,).
     """
@@ -94,7 +97,7 @@ class Orientation:
     reflections
         The n reflections, outliers included.
     point
-        Positions of their camera, ENU metres, (n, 3).
+        Positions of the camera for each reflection, ENU metres, (n, 3).
     outlier
         (n,).
     weight

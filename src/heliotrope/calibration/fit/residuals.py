@@ -100,7 +100,7 @@ def frame(direction: FloatArray) -> FloatArray:
 def _beam_map(
     axes: FloatArray, v: FloatArray, source: FloatArray, destination: FloatArray
 ) -> FloatArray:
-    """Return the change of the reflected ray when the normal moves along the tangent axes, (M, 2, 2)."""
+    """Return the derivative of the reflected ray with respect to the normal, (M, 2, 2)."""
     # d(2 (n·s) n − s) = 2 ((dn·s) n + (n·s) dn)
     across = frame(destination)
     along = np.einsum("mak,mk->ma", axes, source)

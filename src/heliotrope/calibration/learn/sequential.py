@@ -95,7 +95,7 @@ def predict_in_turn(
 
     The hyperparameters remain those of the training part, so other heliostats contribute only
     through the population. For every prediction the parameters, regimes, steps and outliers are
-    learnt again from the whole history. Simultaneous sightings do not influence each other.
+    learnt again from all the earlier sightings. Simultaneous sightings do not influence each other.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def _predict(
     priors: dict[str, npt.ArrayLike],
     runner: Runner | None,
 ) -> Prediction:
-    """Predict some sightings, each by a copy of its heliostat that has learnt the earlier ones."""
+    """Predict sightings, each from a copy of its heliostat that has learnt the earlier ones."""
     sightings = learned.sightings
     histories = [_before(learned, int(row)) for row in asked]
     owner = np.repeat(np.arange(len(asked)), [len(h) for h in histories])
@@ -143,7 +143,10 @@ def _predict(
 
 
 def _before(learned: Learned, row: int) -> npt.NDArray[np.intp]:
-    """Sightings of the same heliostat before ``row``; for an unknown time, those learnt from."""
+    """Return the earlier sightings of the heliostat of sighting ``row``.
+
+    If the sighting's time is unknown, return those that the field was learnt from.
+    """
     sightings: Sightings = learned.sightings
     mine = sightings.heliostat == sightings.heliostat[row]
     when = sightings.time[row]
