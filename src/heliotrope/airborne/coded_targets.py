@@ -37,7 +37,7 @@ class CodedTarget:
     corners: FloatArray
 
     def at(self, u: npt.ArrayLike, v: npt.ArrayLike) -> FloatArray:
-        """Return points of the sheet, (..., 3), given in cells right and down of the upper left corner."""
+        """Return points of the sheet, (..., 3), at cells right and down of its upper left corner."""
         a, b = as_float(u)[..., None] / CELLS, as_float(v)[..., None] / CELLS
         start = self.corners[0]
         right, down = self.corners[1] - start, self.corners[3] - start
@@ -64,7 +64,7 @@ def white_cells(number: int) -> npt.NDArray[np.bool_]:
 def square_target(
     number: int, center: npt.ArrayLike, side: float, right: npt.ArrayLike, down: npt.ArrayLike
 ) -> CodedTarget:
-    """Return a target with sides of length ``side``, m, along unit vectors (3,) about ``center``."""
+    """Return a target with sides of ``side`` m along unit vectors (3,), centred at ``center``."""
     half = 0.5 * side
     x, y = half * as_float(right), half * as_float(down)
     return CodedTarget(number, as_float(center) + np.stack([-x - y, x - y, x + y, y - x]))

@@ -146,8 +146,7 @@ class Spots:
 
 
 def decode(path: str | Path) -> Picture:
-    """Return a photograph in the sensor's rows and columns, with channels blue, green, red, (H, W,
-    3).
+    """Return a photograph in the rows and columns of the sensor, blue-green-red, (H, W, 3).
 
     Raises
     ------
@@ -333,7 +332,7 @@ def find_outlines(
 def _lines(
     points: FloatArray, known: Mask, outward: FloatArray
 ) -> tuple[FloatArray, FloatArray, Mask]:
-    """Return lines a x + b y = c, (M, 4, 3), their errors, and a mask of lines with enough points."""
+    """Return lines a x + b y = c, (M, 4, 3), their errors, and a mask of those well supported."""
     weight = known.astype(np.float64)
     enough = weight.sum(axis=-1) >= 4
     weight = np.where(enough[..., None], weight, 1.0)

@@ -40,8 +40,7 @@ _FARTHEST, _WEAKEST = 0.6, 0.4
 def cross_edges(
     colour: FloatArray, steps: FloatArray, reach: float, clear: Mask, groups: int, *, fitted: bool
 ) -> tuple[FloatArray, FloatArray, Mask]:
-    """Return offsets of the edges, (M, 4, G), the least contrast, (M,), and a mask of valid
-    offsets.
+    """Return edge offsets, (M, 4, G), the least contrast, (M,), and a mask of valid offsets.
 
     Parameters
     ----------

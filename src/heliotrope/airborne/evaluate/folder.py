@@ -65,7 +65,7 @@ class FlightData:
 
     @property
     def dark(self) -> bool:
-        """Whether the photographs show the lamp but no mirror edge; the flight is evaluated alone."""
+        """Whether the photographs show the lamp but no mirror edge; such a flight stands alone."""
         return not self.corners and any(s.has_lights for s in self.seen)
 
     def unused(self) -> list[str]:

@@ -419,7 +419,7 @@ def is_dark(picture: Picture) -> bool:
 
 
 def expected_feet(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> tuple[FloatArray, Rows]:
-    """Return where mirrors in expected poses show the lamp, (K, 3), and the mirror indices, (K,)."""
+    """Return where mirrors in expected poses show the lamp, (K, 3), and mirror indices, (K,)."""
     between = photo.position + 0.5 * (photo.led_position(camera) - photo.position)
     local = np.einsum("nji,nj->ni", stand.rotation, between - stand.vertex)
     half = 0.5 * np.ptp(stand.outline[..., :2], axis=1)

@@ -33,7 +33,7 @@ _TICK, _NUMBER = 100, 500
 
 @dataclass(frozen=True)
 class Sheets:
-    """The files that were written (pictures and table), and the number of outlines in each picture."""
+    """Files that were written (pictures and table), and number of outlines in each picture."""
 
     pictures: tuple[Path, ...]
     table: Path

@@ -57,8 +57,7 @@ class Turned:
     common: FloatArray
 
     def place_covariance(self, place: float) -> FloatArray:
-        """Return the covariance of each mirror's position, shared by its reflections, m², (N, 3,
-        3).
+        """Return the covariance of each mirror's position shared by its reflections, m², (N, 3, 3).
 
         Parameters
         ----------

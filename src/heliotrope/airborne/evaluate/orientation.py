@@ -189,7 +189,7 @@ class Orientations:
     left_out: Mapping[str, str]
 
     def of(self, name: str) -> Orientation | None:
-        """Return the orientation of heliostat ``name``, or None if it was not measured."""
+        """Return the orientation of heliostat ``name``; None if the heliostat was not measured."""
         return next((o for o in self.found if self.names[o.heliostat] == name), None)
 
 
@@ -201,7 +201,7 @@ def differences(
     *,
     slopes: bool = True,
 ) -> FloatArray:
-    """Return the rotations from expected to measured normals about x and y, rad, (n, 2).
+    """Return the rotations about x and y from expected to measured normals, rad, (n, 2).
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def differences(
     shape
         Shape of its mirror.
     rotation, vertex
-        Its orientation, (3, 3), and vertex, ENU metres, (3,).
+        Orientation, (3, 3), and vertex, ENU metres, (3,), of the mirror.
     slopes
         Whether expected normals include the slope map, if there is one.
     """
@@ -234,7 +234,7 @@ def turned(R: npt.ArrayLike, rot: npt.ArrayLike) -> FloatArray:
 def rotation_between(R: npt.ArrayLike, other: npt.ArrayLike) -> FloatArray:
     """Return rotX, rotY and rotZ, rad, (3,), that rotate orientation ``R`` into ``other``.
 
-    They are the components of a single rotation, along R's own axes.
+    The three angles are the components of a single rotation vector along the axes of R.
     """
     from scipy.spatial.transform import Rotation
 
@@ -272,17 +272,18 @@ def measure(
     slopes
         Whether to use the slope map, if available.
     budget
-        Errors common to all points; None: the default budget.
+        Errors common to all points; None for the default budget.
     place
-        Covariance of the mirror's position relative to the drone, m², (3, 3), see
+        Covariance of the mirror's position relative to the drone, m², (3, 3); see
         `Budget.covariance`.
     mean
-        "area", weighted to represent the whole mirror, or "plain", equal weights, as in HelioPoint.
-        Without a slope map the plain mean is worse, because points cluster where the surface is
-        flat.
+        "area" for weights that represent the whole mirror, or "plain" for equal weights, as in
+        HelioPoint. Without a slope map the plain mean is worse, because points cluster where the
+        surface is flat.
     scatter
         Prior standard deviation of one difference, rad, which stabilises σ if there are few
-        reflections. By default HelioPoint's value, with or without a slope map.
+        reflections. The default is HelioPoint's value, which depends on whether there is a slope
+        map.
     alpha, rounds
         False-alarm probability of the outlier test, and number of corrections before it.
 
@@ -304,7 +305,7 @@ def measure(
         return turned(R, _mean(omega, own, shape, keep, mean))
 
     for _ in range(rounds):
-        # Any mean brings the points to their positions.
+        # Any kind of mean moves the points to their positions.
         R = update(R, "plain")
     omega = differences(own, shape, R, where(R), slopes=slopes)
     keep = ~(rosner(omega[:, 0], alpha=alpha) | rosner(omega[:, 1], alpha=alpha))
@@ -343,12 +344,13 @@ def measure_field(
     slopes, budget, mean
         See `measure`.
     places
-        Covariances of their positions relative to the drone, m², (N, 3, 3).
+        Covariances of the mirror positions relative to the drone, m², (N, 3, 3).
 
     Notes
     -----
-    A heliostat that cannot be measured is listed with the reason, and the rest continue. For
-    mirrors with few reflections, σ is stabilised by the scatter of the well-measured mirrors.
+    A heliostat that cannot be measured is listed with the reason, and the other heliostats are
+    still measured. For mirrors with few reflections, σ is stabilised by the scatter of the
+    well-measured mirrors.
     """
     turns, feet = as_float(rotation), as_float(vertex)
     covariances = None if places is None else as_float(places)
@@ -439,7 +441,7 @@ def _result(
     known = spread_mean(kept, shape, part.facet, uv, prior)
     every = vertex + shape.point_at(own.facet, own.xy) @ R.T
     point = every[keep]
-    # A turn about x moves the normal towards −y, one about y towards x.
+    # A rotation about x moves the normal towards −y, and a rotation about y towards x.
     axes = np.stack([-R[:, 1], R[:, 0]])
     weight = np.zeros(len(own))
     weight[keep] = known.weights if mean == "area" else 1.0 / len(kept)
@@ -476,7 +478,7 @@ def _facet_means(
     for k in range(len(shape)):
         on = facet == k
         used = on & keep
-        # On a canted facet most points are outliers of the mirror, but right for the facet.
+        # On a wrongly canted facet most points are outliers of the mirror, but valid for the facet.
         mine = difference[used if 2 * used.sum() >= on.sum() else on]
         mean = mine.mean(axis=0) if len(mine) else np.full(2, np.nan)
         means.append(FacetMean(k, len(mine), mean, plain_sigma(mine)))
@@ -537,11 +539,11 @@ def _tilt_by_gradient(o: Orientation, xy: FloatArray, offset: FloatArray) -> Flo
 
 
 def _off_the_others(o: Orientation, f: FacetMean) -> FloatArray | None:
-    """Return a facet's mean minus the median of the others' means, if significant."""
+    """Return a facet's mean minus the median of the other facets' means, if significant."""
     others = [g for g in o.facets if g.facet != f.facet and g.count >= 3]
     if f.count < 3 or not others:
         return None
-    # Use the median, so that the one deviating facet is reported and not all the others.
+    # Use the median, so that the deviating facet is reported rather than all the other facets.
     away = f.mean - np.median([g.mean for g in others], axis=0)
     error = np.sqrt(f.sigma**2 + np.mean([g.sigma**2 for g in others], axis=0))
     if ((np.abs(away) > _CANTED_SIGMA * error) & (np.abs(away) > _CANTED)).any():
