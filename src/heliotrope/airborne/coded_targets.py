@@ -37,7 +37,7 @@ class CodedTarget:
     corners: FloatArray
 
     def at(self, u: npt.ArrayLike, v: npt.ArrayLike) -> FloatArray:
-        """Return points of the sheet, (..., 3), at cells right and down of its upper left corner."""
+        """Return points of the sheet, (..., 3), at cells right and down of its top left corner."""
         a, b = as_float(u)[..., None] / CELLS, as_float(v)[..., None] / CELLS
         start = self.corners[0]
         right, down = self.corners[1] - start, self.corners[3] - start

@@ -144,7 +144,7 @@ class MirrorShape:
         )
 
     def on_facet(self, facet: npt.ArrayLike, uv: npt.ArrayLike) -> FloatArray:
-        """Return the surface points (K, 3) at ``uv`` (K, 2), m, along the axes of ``facet`` (K,)."""
+        """Return the surface points (K, 3) at ``uv`` (K, 2), m, on the axes of ``facet`` (K,)."""
         k, own = np.asarray(facet, dtype=np.intp), as_float(uv)
         high = np.sum(own**2, axis=-1) / (4.0 * self.focal[k])
         return as_float(
@@ -153,7 +153,7 @@ class MirrorShape:
         )
 
     def along_facet(self, facet: npt.ArrayLike, xy: npt.ArrayLike) -> FloatArray:
-        """Convert concentrator positions ``xy``, m, (K, 2), to positions on ``facet`` (K,), m, (K, 2)."""
+        """Convert concentrator positions ``xy`` (K, 2), m, to positions on ``facet`` (K,), m."""
         k, target = np.asarray(facet, dtype=np.intp), as_float(xy)
         inverse = np.linalg.inv(np.swapaxes(self.axes[k][:, :2, :2], -1, -2))
         uv = np.zeros((len(k), 2))
@@ -201,13 +201,13 @@ class MirrorShape:
         return normalize(np.einsum("ki,kij->kj", own, self.axes[k]))
 
     def slope_at(self, facet: IntArray, uv: FloatArray) -> FloatArray:
-        """Return the slope map, rad, (K, 2), at ``uv``, m, (K, 2), along the axes of facets (K,)."""
+        """Return the slope map, rad, (K, 2), at ``uv`` (K, 2), m, on the axes of facets (K,)."""
         cell, st = self._cell(facet, uv)
         return self.patch(facet, cell).at(st)[0]
 
     @cached_property
     def nodes(self) -> FloatArray:
-        """Slope deviations at the cell corners, rad, (F, I, J, 2), extended constantly to the edges."""
+        """Slope deviations at the cell corners, rad, (F, I, J, 2); constant towards the edges."""
         if self.slope is None:
             return np.zeros((len(self), _CELLS + 1, _CELLS + 1, 2))
         return np.pad(self.slope, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
@@ -535,7 +535,7 @@ def _newton(
     ends: tuple[FloatArray, FloatArray],
     st: FloatArray,
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Return fractional cell positions (K, 2) at which g is 0, and a mask of those that converged."""
+    """Return fractional cell positions (K, 2) at which g is 0, and a mask of convergence."""
     good = np.zeros(len(st), dtype=np.bool_)
     for _ in range(_ITERATIONS):
         g, slope = _law(shape, facet, patch, ends, st)

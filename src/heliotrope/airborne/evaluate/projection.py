@@ -104,7 +104,7 @@ def overlay(picture: Picture, camera: LedCamera, photo: Photo, stand: MirrorPose
 def _drawing(
     photo: Photo, camera: LedCamera, stand: MirrorPoses, scale: float, border: int
 ) -> tuple[Image, FloatArray]:
-    """Return the drawing of the mirrors with a border, and the mirror corners, px of the picture."""
+    """Return the drawing of the mirrors with a border, and the mirror corners, picture px."""
     import cv2
 
     corners, away = outlines(photo, camera, stand)

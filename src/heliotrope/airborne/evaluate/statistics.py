@@ -270,7 +270,7 @@ class _Areas:
         return cls(shape, facet, np.linalg.norm(uv[:, None] - grid, axis=-1))
 
     def at(self, length: float) -> tuple[FloatArray, float]:
-        """Return the mean correlation of each point with the mirror, (n,), and within the mirror."""
+        """Return the mean correlation of each point with the mirror, (n,), and within it."""
         area = np.prod(self.shape.half_size, axis=-1)
         share = area / area.sum()
         to_mirror = share[self.facet] * matern(self.to_area / length).mean(axis=-1)

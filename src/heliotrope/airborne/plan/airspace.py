@@ -98,7 +98,7 @@ class KeepOut:
         )
 
     def free(self, a: FloatArray, b: FloatArray) -> Mask:
-        """Return a mask, (M,), of the straight legs from ``a`` to ``b``, (M, 3), that stay outside."""
+        """Return a mask, (M,), of the legs from ``a`` to ``b``, (M, 3), that stay outside."""
         free = np.ones(len(a), dtype=np.bool_)
         low, high = np.minimum(a, b), np.maximum(a, b)
         near = np.flatnonzero(~((high < self._box[0]) | (low > self._box[1])).any(axis=1))
@@ -309,7 +309,7 @@ class Airspace:
         return as_float(route[keep].reshape(-1, 3))
 
     def _graph(self, level: float) -> tuple[FloatArray, FloatArray]:
-        """Return detour corners at a height, (M, 3), and lengths of free legs, (M, M), 0 if not free."""
+        """Return detour corners at a height, (M, 3), and lengths of free legs, (M, M), else 0."""
         if level not in self._graphs:
             corners = self._corners
             nodes = np.column_stack([corners, np.full(len(corners), level)])
