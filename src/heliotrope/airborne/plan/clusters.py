@@ -83,7 +83,7 @@ def ground_areas(position: npt.ArrayLike) -> FloatArray:
     low, high = flat.min(axis=0) - spacing, flat.max(axis=0) + spacing
     counts = np.ceil((high - low) / side).astype(np.int64)
     while counts.prod() > max(100_000, 4 * _SQUARES * len(flat)):
-        # Distant outlying heliostats must not make the grid of squares larger.
+        # Distant outlying heliostats would make the grid too large, so the squares are enlarged.
         side *= 2.0
         counts = np.ceil((high - low) / side).astype(np.int64)
     east, north = (low[k] + side * (np.arange(counts[k]) + 0.5) for k in (0, 1))
