@@ -68,7 +68,7 @@ class Stack:
 
     @property
     def axes(self) -> tuple[FloatArray, FloatArray]:
-        """Position of the columns right of the centre, m, (W,), and of the rows above it, m, (H,)."""
+        """Positions of columns right of, (W,), and of rows above the centre, (H,), m."""
         _, rows, columns = self.values.shape
         return (
             self.first[0] + self.step * np.arange(columns),
