@@ -251,7 +251,7 @@ def _by_view(results: Sequence[FoundTarget]) -> list[tuple[FaceView, list[FoundT
 def _empty_picture(
     without: Frame, view: FaceView, camera: Camera | None, chosen: PhotographSettings, rim: int
 ) -> Rectified:
-    """Return the face from the frame without the beam, located again as the camera may have moved."""
+    """Return the face in the frame without the beam, located anew if the camera moved."""
     again = find_targets(without, list(view.face.targets), camera, [view], chosen.pictures)
     known = next((f.view for f in again if f.view is not None), None)
     if known is None:

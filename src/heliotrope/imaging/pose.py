@@ -174,13 +174,13 @@ class _Problem:
         )
 
     def turn(self, x: FloatArray) -> FloatArray:
-        """Return the rotation from ENU to camera axes, (3, 3)."""
+        """Return the rotation from ENU to camera axes, (3, 3), for a vector of unknowns."""
         import cv2
 
         return as_float(cv2.Rodrigues(x[:3])[0])
 
     def lens(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return lens matrix and distortion for a vector of unknowns."""
+        """Return the lens matrix and distortion for a vector of unknowns."""
         if not self.free:
             return self.base.matrix, self.base.distortion
         f = float(np.exp(np.clip(x[6], -20.0, 20.0)))
@@ -202,19 +202,19 @@ class _Problem:
         return as_float(projected).reshape(-1, 2), np.concatenate(parts, axis=-1)
 
     def shift(self, x: FloatArray) -> FloatArray:
-        """Return the translation, m."""
+        """Return the translation, m, for a vector of unknowns."""
         return x[3:6] * self.lens(x)[0][0, 0] if self.free else x[3:6]
 
     @property
     def prior(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and standard deviation of log focal length, principal point and k1."""
+        """Prior mean and standard deviation of log focal length, principal point and k1."""
         width, height = self.base.size
         mean = [LOG_FOCAL + np.log(width), 0.5 * (width - 1), 0.5 * (height - 1), 0.0]
         sigma = [LOG_FOCAL_SIGMA, CENTER_SIGMA * width, CENTER_SIGMA * width, K1_SIGMA]
         return np.array(mean), np.array(sigma)
 
     def residuals(self, x: FloatArray) -> FloatArray:
-        """Return whitened residuals, those of the priors last."""
+        """Return whitened residuals, with the residuals of the priors last."""
         apart = self.predict(x, self.local)[0] - self.pixels
         white = np.einsum("nij,nj->ni", self.whitener, apart).ravel()
         mean, sigma = self.prior
@@ -230,7 +230,7 @@ class _Problem:
 def _observed(
     points: npt.ArrayLike, pixels: npt.ArrayLike, sigma: npt.ArrayLike
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return points, pixels and W (N, 2, 2) with ``W.T @ W`` the inverse of the covariance."""
+    """Return points, pixels and W (N, 2, 2), where ``W.T @ W`` is the inverse covariance."""
     where, observed, noise = as_vectors(points, "points"), as_float(pixels), as_float(sigma)
     if where.ndim != 2 or observed.shape != (len(where), 2):
         raise InputError(
@@ -315,11 +315,12 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
     camera = problem.camera(x)
     slopes = problem.slopes(x)
     freedom = len(slopes) - len(x)
-    # Scale only if chance explains the residuals in less than 1 %; otherwise it would add noise.
+    # Scale only if the probability of the residuals by chance is below 1 %; otherwise scaling would
+    # add noise.
     scale = chi2 / freedom if freedom and chi2 > chdtri(freedom, 0.01) else 1.0
     slopes[: 2 * len(problem.local)] /= np.sqrt(scale)
     close = [y for cost, y in solved[1:] if cost - chi2 < 9.0 * scale]
-    # Ignore the same pose reached from another start.
+    # Ignore the same pose if it was reached from another start.
     differ = [y for y in close if np.ptp(problem.turn(y) - problem.turn(x)) > 0.01]
     other = problem.camera(differ[0]) if differ else None
     size = np.linalg.norm(slopes, axis=0)
@@ -360,7 +361,7 @@ def _to_pose(problem: _Problem, x: FloatArray) -> FloatArray:
 
 
 def _plane_sigma(problem: _Problem, x: FloatArray, raw: FloatArray) -> float:
-    """Return the standard deviation of pixels' positions on the plane, at and between points."""
+    """Return the standard deviation of pixel positions on the plane, at and between points."""
     axes = np.linalg.svd(problem.local)[2][:2]
     few = problem.local[:: len(problem.local) // 40 + 1]
     points = (0.5 * (few + few[:, None])).reshape(-1, 3)
