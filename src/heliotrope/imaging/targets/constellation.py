@@ -147,7 +147,7 @@ def match(
 def _guesses(
     candidates: Candidates, marks: Constellation, up: FloatArray, upright: bool
 ) -> tuple[FloatArray, Places, Places]:
-    """Return linear maps from plane to pixels, (G, 2, 2), and the mark and candidate behind each."""
+    """Return linear maps from plane to pixels (G, 2, 2), with the mark and candidate of each."""
     pair, mark = np.nonzero(candidates.drawing[:, None] == marks.which[None])
     # A drawing is first rotated and then placed in the plane, so B = A · turn.
     linear = candidates.linear[pair] @ np.swapaxes(marks.turn[mark], 1, 2)

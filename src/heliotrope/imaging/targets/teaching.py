@@ -181,8 +181,8 @@ def teach(
         Pixels, keyed by the names in `known_points`. There must be four or more, each within
         `REACH` of its true position.
     camera
-        Name of the target. If the plant has a camera of that name, its lens is taken as known; otherwise the
-        lens is estimated too; see `pose.calibrate_marks`.
+        Name of the camera. If the plant has a camera of that name, its lens is taken as known;
+        otherwise the lens is estimated too (see `pose.calibrate_marks`).
     wishes, wish
         Marks to define, keyed by the name of the point, and the mark for all other points.
     sigma
