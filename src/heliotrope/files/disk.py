@@ -29,7 +29,9 @@ class Disk(Protocol):
     """Executor of jobs that wait for a disk."""
 
     def do(self, work: Work, then: Then) -> None:
-        """Do work after all earlier work, then call ``then`` in the loop.
+        """Do work after all earlier work, then call ``then`` in the event loop.
+
+        The argument of ``then`` is the error of the work, or None if the work succeeded.
 
         Raises
         ------

@@ -80,7 +80,7 @@ def read_xml(path: str | Path, what: str) -> Document:
     content = read_bytes(file)
     tags = content.count(b"<")
     check_count(file, tags, 2 * XML_PARTS, "tags", f"divide it; it should be {what}")
-    # All attributes of a tag are in memory before they can be counted, so tags are limited first.
+    # All attributes of a tag are in memory before they can be counted, so reject long tags first.
     if (tag := _LONG_TAG.search(content)) is not None:
         line = content.count(b"\n", 0, tag.start()) + 1
         raise FormatError(

@@ -209,7 +209,7 @@ def _changed(row: Condition, row_limits: Mapping[str, float]) -> Condition:
 
 
 def _ordered(row: Condition, rows: Iterable[Condition]) -> None:
-    """Reject a weaker action at a later limit than a stronger action for the same reading."""
+    """Reject a weaker action that would trip after a stronger action for the same reading."""
     for other in rows:
         if other.reading != row.reading or other.act == row.act:
             continue

@@ -66,7 +66,8 @@ class Identified:
     reason
         Why no solution is trusted; an empty string if one is.
     shifted
-        Whether the field seems to fit only because it is shifted by about one row of heliostats.
+        Whether the apparent fit is that of a shifted field. A drawing laid over the photograph
+        would then seem to fit in the same wrong position.
     """
 
     rotation: FloatArray

@@ -31,8 +31,8 @@ from heliotrope.values import amount
 #: Parameters are doubtful if the sum of their squares, in units of their prior standard deviations,
 #: exceeds this.
 DOUBTFUL = 25.0
-#: If the other sightings contradict a sighting by more than this beam error, rad, it shows the beam
-#: of another heliostat.
+#: If the other sightings contradict a sighting by more than this beam error, rad, it shows a
+#: different beam.
 ELSEWHERE = 5e-3
 #: A median beam error above this, rad, cannot be explained by any change that a heliostat undergoes
 #: in its life.

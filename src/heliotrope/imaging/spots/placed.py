@@ -33,8 +33,9 @@ class PlacedSpot:
     pixel
         Pixel of the frame, (2,).
     flux
-        Light divided by the frame's exposure and gain, in full scales times m² per second at gain
-        1. It makes frames from one camera comparable. NaN if exposure or gain is unknown.
+        Light divided by the frame's exposure and gain (unit: full scale times m² per second, at a
+        gain of one), which makes frames from one camera comparable; NaN if exposure or gain is
+        unknown.
     """
 
     spot: Spot
