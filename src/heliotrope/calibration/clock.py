@@ -1,4 +1,4 @@
-"""Test whether the plant clock was wrong, as one hypothesis for all heliostats of a field.
+"""Test whether one clock error explains the sightings of all heliostats of a field.
 
 The sun's direction is computed from the time. A clock that is fast by a minute shifts every sun
 position by 4 mrad. The parameters of each heliostat absorb most of that shift, and the remainder
@@ -135,7 +135,7 @@ def check_clock(
 
 @dataclass(frozen=True)
 class _Step:
-    """The shift that the sun positions need in total, and its standard deviation, s."""
+    """The total shift that the sun positions need, and its standard deviation, s."""
 
     shift: float
     sigma: float
@@ -157,7 +157,7 @@ def _settled(
 def _step(
     mechanism: Mechanism, sightings: Sightings, model: tuple[str, ...], site: Site, shift: float
 ) -> _Step:
-    """Return one Gauss-Newton step from a shift.
+    """Return the shift after one Gauss-Newton step from ``shift``.
 
     Let H be the normal matrix of a heliostat's own parameters, B their coupling with the shift and
     Z the normal matrix of the shift. The heliostat then provides the information Z - B^T H^-1 B on
@@ -214,7 +214,7 @@ def _noise(fitted: FieldFit) -> FloatArray:
 
 
 def later(sightings: Sightings, site: Site, shift: float) -> Sightings:
-    """Return sightings of the sun with each sun position as it is ``shift`` s later.
+    """Return sightings of the sun with every sun position moved on by ``shift`` s.
 
     If the time is known and matches the stated sun vector, the sun position is computed for the
     shifted time; otherwise the stated vector is rotated about the pole.

@@ -183,7 +183,7 @@ def check_fraction(fraction: float) -> None:
 def _by_neighbourhood(
     sightings: Sightings, rows: npt.NDArray[np.intp], fraction: float, seed: int
 ) -> npt.NDArray[np.intp]:
-    """Order the sightings of one heliostat so that whole neighbourhoods of the sky come last."""
+    """Order one heliostat's sightings so that whole neighbourhoods of sun positions come last."""
     rng = np.random.default_rng((seed, int(sightings.heliostat[rows[0]])))
     sky = sightings.source[rows]
     many = max(3, round(NEIGHBOURHOOD * len(rows)))

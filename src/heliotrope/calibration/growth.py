@@ -84,7 +84,7 @@ class Growth:
     def grown(
         self, covariance: npt.ArrayLike, names: Sequence[str], days: npt.ArrayLike
     ) -> FloatArray:
-        """Return covariances as they are after a number of days, (..., P, P) for days (...)."""
+        """Return what covariances (..., P, P) have grown to after ``days`` (...)."""
         added = self.variances(names, days)
         return as_float(as_float(covariance) + added[..., None] * np.eye(len(names)))
 

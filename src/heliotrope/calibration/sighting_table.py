@@ -135,7 +135,7 @@ def _times(rows: Rows, column: str, *, optional: bool) -> FloatArray:
 
 
 def _without(rows: Rows, sightings: Sightings, reasons: Mapping[int, str]) -> Sightings:
-    """Refuse the rows of sightings with a reason, and return the others."""
+    """Reject the rows of sightings that have a reason, and return the other sightings."""
     good = rows.good
     rows.reasons |= {int(good[k]): ("", reason) for k, reason in reasons.items()}
     return sightings.take(np.isin(good, rows.good))

@@ -365,7 +365,7 @@ def ray_directions(s: Sightings, vertex: npt.ArrayLike) -> tuple[FloatArray, Flo
 
 
 def bisector_covariance(s: Sightings, vertex: npt.ArrayLike, axes: npt.ArrayLike) -> FloatArray:
-    r"""Return the covariance of the bisectors of source and destination, (M, 2, 2), rad².
+    r"""Return the covariance of the bisectors of source and destination, rad², (M, 2, 2).
 
     With s and t the unit vectors to both ends and v their bisector, to first order
 
@@ -482,7 +482,7 @@ def drone(
     led_covariance: npt.ArrayLike = 0.0,
     camera_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
-    """Return sightings from a lamp to the drone camera that sees its reflection (HelioPoint).
+    """Return sightings from a lamp to the drone camera that sees the reflection (HelioPoint).
 
     Parameters
     ----------
@@ -554,7 +554,7 @@ def field_camera(
     sun_covariance: npt.ArrayLike = 0.0,
     camera_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
-    """Return sightings from the sun to a field camera that sees it in the mirror (eSolar).
+    """Return sightings from the sun to a field camera that sees the sun in the mirror (eSolar).
 
     Parameters
     ----------

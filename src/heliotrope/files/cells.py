@@ -341,7 +341,7 @@ def rows_under(
     table: list[list[str]],
     known: Iterable[str] = (),
 ) -> Rows:
-    """Return rows, given the cells of a header and the places and cells of the rows below it.
+    """Return rows from a header and from the places and cells of the rows below the header.
 
     Raises
     ------
@@ -534,7 +534,7 @@ def _number(cell: Any) -> float:
 
 
 def _hint(text: str) -> str:
-    """Return the remedy for a number in another country's notation; "" if it is not one."""
+    """Return the remedy for a number in another country's notation; "" for any other text."""
     if _DECIMAL_COMMA.fullmatch(text):
         return "write a point, not a comma"
     if _THOUSANDS.fullmatch(text):

@@ -41,7 +41,7 @@ class Disk(Protocol):
         ...
 
     def close(self) -> None:
-        """Finish the pending work if the disk allows it soon, and end."""
+        """Finish the pending work, if the disk is fast enough, and stop."""
         ...
 
 

@@ -73,7 +73,7 @@ def read_document(
 
 
 def _missing(errors: Sequence[Any]) -> tuple[str, tuple[Any, ...]]:
-    """Return one line on all keys missing in the table of the first error, and the table.
+    """Return one line about all keys missing in the table of the first error, and that table.
 
     The line is empty if the first error is of a different kind.
     """

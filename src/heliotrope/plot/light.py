@@ -144,7 +144,7 @@ def flux_figure(found: PlantFlux, by: str = "total") -> "Figure":
 
 
 def aim_figure(plan: AimPlan) -> "Figure":
-    """Return a figure of a plan's flux, its quantile over the limit, and the active limits.
+    """Return a figure of a plan's flux, its quantile relative to the limit, and active limits.
 
     Parameters
     ----------

@@ -158,9 +158,10 @@ def start(
 
 
 def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetyState:
-    """Return the state with one row limited to some subjects and to those that have tripped it.
+    """Return the state in which one row is evaluated only for some subjects.
 
-    This is meant for rows about heliostats, of which only a few ever need evaluation.
+    Subjects for which the row has already tripped are kept. This is meant for rows about
+    heliostats, of which only a few ever need evaluation.
 
     Parameters
     ----------

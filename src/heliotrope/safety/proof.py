@@ -121,7 +121,7 @@ def _first(names: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True)
 class Proof:
-    """The record of one DEFOCUS or STOW order, which names every heliostat that has not obeyed.
+    """Record of one DEFOCUS or STOW order that shows which heliostats have not obeyed.
 
     Attributes
     ----------

@@ -559,7 +559,7 @@ def _utc(seconds: float) -> datetime:
 
 
 def unix_seconds(times: Times, *, unknown: bool = False) -> FloatArray:
-    """Return times as Unix seconds (UTC) of the same shape; all functions read times here.
+    """Return times as Unix seconds (UTC) of the same shape; all functions read times with this.
 
     Parameters
     ----------
@@ -651,7 +651,7 @@ def _label(index: Sequence[int]) -> str:
 
 
 def _check_years(seconds: FloatArray, site: Site) -> None:
-    """Reject times outside the validity of ΔT, or of SPA."""
+    """Reject times for which ΔT is unknown, unless the site states its own ΔT."""
     if site.delta_t is None:
         _refuse_outside(
             seconds, _FIRST_DELTA_T, _LAST_DELTA_T, "the known ΔT; give Site(delta_t=...) in s"

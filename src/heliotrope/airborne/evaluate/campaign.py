@@ -63,7 +63,7 @@ class Campaign:
         return f"common RTK offset, recorded minus true: {', '.join(parts)} mm"
 
     def warnings(self, prior: float) -> list[str]:
-        """Return a warning if the offset far exceeds ``prior``, its standard deviation, m."""
+        """Return a warning if the offset far exceeds its prior standard deviation, m."""
         size = float(np.abs(self.offset).max())
         if size <= 3.0 * prior:
             return []
@@ -132,7 +132,7 @@ def _cause(lines: Sequence[str]) -> str:
 
 
 def flight_groups(flights: Sequence[FlightData], usable: Sequence[int]) -> list[list[int]]:
-    """Return groups of flights that share heliostats and camera, up to `MOST_CORNERS` each."""
+    """Return groups of flights that share heliostats and camera, within `MOST_CORNERS`."""
     groups = [[k] for k in usable if flights[k].dark]
     remaining = [k for k in usable if not flights[k].dark]
     while remaining:

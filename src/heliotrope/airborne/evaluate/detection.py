@@ -1,4 +1,4 @@
-"""Detect mirrors, as bright patches, their outlines and lamp reflections in one photograph.
+"""Detect mirrors (as bright patches), their outlines and lamp reflections in a photograph.
 
 Pixel values are converted to light by the inverse of the sRGB curve before anything is measured;
 otherwise edges and spots would be displaced.
@@ -332,7 +332,7 @@ def find_outlines(
 def _lines(
     points: FloatArray, known: Mask, outward: FloatArray
 ) -> tuple[FloatArray, FloatArray, Mask]:
-    """Return lines a x + b y = c, (M, 4, 3), their errors, and a mask of those well supported."""
+    """Return lines a x + b y = c, (M, 4, 3), their errors, and a mask of the valid lines."""
     weight = known.astype(np.float64)
     enough = weight.sum(axis=-1) >= 4
     weight = np.where(enough[..., None], weight, 1.0)

@@ -65,7 +65,10 @@ class FlightData:
 
     @property
     def dark(self) -> bool:
-        """Whether the photographs show the lamp but no mirror edge; such a flight stands alone."""
+        """Whether the photographs show the lamp but no mirror edge.
+
+        A dark flight is evaluated without the other flights of its campaign.
+        """
         return not self.corners and any(s.has_lights for s in self.seen)
 
     def unused(self) -> list[str]:

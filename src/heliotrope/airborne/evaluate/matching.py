@@ -163,7 +163,7 @@ def _turned(
     matches: Matches,
     rows: npt.NDArray[np.intp],
 ) -> Photo | str:
-    """Return a photograph with the attitude from its named positions, or why there is none."""
+    """Return a photograph with the attitude from its named positions, or why that failed."""
     unknown = [matches.heliostat[k] for k in rows if matches.heliostat[k] not in stand.names]
     if unknown:
         return f"heliostat {unknown[0]} was not commanded in this flight; correct the name"

@@ -225,7 +225,7 @@ def differences(
 
 
 def turned(R: npt.ArrayLike, rot: npt.ArrayLike) -> FloatArray:
-    """Return an orientation (3, 3) rotated by rotX and rotY (2,), rad, about its own axes."""
+    """Return orientation ``R`` rotated by rotX and rotY, rad, about its own axes, (3, 3)."""
     x, y = as_float(rot)
     axis = np.array([x, y, 0.0])
     return as_float(R) @ rotation(axis, float(np.hypot(x, y)))

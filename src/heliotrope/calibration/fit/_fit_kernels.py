@@ -227,7 +227,7 @@ def _median_scale(squares, keep, rows):
 
 @njit(**INNER)
 def _covariance(hessian, sigma, gradient, factor, step, out):
-    """Compute the covariance of x = y σ, (P, P); leave ``out`` unchanged if it is singular."""
+    """Compute the covariance of x = y σ, (P, P), unless the Hessian is singular."""
     if cholesky_solve(hessian, gradient, factor, step):
         inverse_from(factor, out)
         for p in range(sigma.shape[0]):

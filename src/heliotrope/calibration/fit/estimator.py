@@ -77,7 +77,7 @@ _TEXTS = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FieldFit(Value, Framed):
-    """Fitted parameters of N heliostats, P each; without the axis N after a fit of one mechanism.
+    """Fitted parameters of N heliostats, or of a single mechanism without the axis N.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ class FieldFit(Value, Framed):
 
     @property
     def parameters(self) -> dict[str, FloatArray]:
-        """Return the values by name, each (N,), as `Mechanism.with_calibration` takes them."""
+        """Return the values by name, (N,) each, in the form that `with_calibration` accepts."""
         return {name: self.values[..., p] for p, name in enumerate(self.names)}
 
     @property
@@ -218,7 +218,7 @@ BY_HELIOSTAT = (
 def parameter_rows(
     names: tuple[str, ...], values: FloatArray, sigma: FloatArray
 ) -> list[tuple[str, str, str]]:
-    """Return a table row per parameter: name, and medians of values and sigmas (N, P) with unit."""
+    """Return one table row per parameter, with the median value and the median sigma."""
     rows = []
     for p, name in enumerate(names):
         scale, unit = parameter_table.shown_in(name)

@@ -161,7 +161,7 @@ class TermFit(Value, Framed):
         return replace(sightings, counts=moved)
 
     def to_send(self, heliostat: npt.ArrayLike, counts: npt.ArrayLike) -> FloatArray:
-        """Return the counts to send, (M, D), so that the mechanism with its terms reaches a pose.
+        """Return the counts, (M, D), with which the mechanism, including its terms, reaches a pose.
 
         Parameters
         ----------
@@ -286,7 +286,7 @@ def _moved(
     terms: Sequence[DriveTerm],
     values: FloatArray,
 ) -> FloatArray:
-    """Return the counts (M, D) at which mechanisms (M,) reach the same pose without their terms."""
+    """Return the counts, (M, D), that produce the same poses without the terms."""
     angles = mechanism.drives.angles(counts)
     for k, drive in enumerate(_places(mechanism, terms)):
         angles[:, drive] += values[:, k] * shapes[:, k]

@@ -1,4 +1,4 @@
-"""Compiled kernels: covariances of sightings whose parameters drift, and what follows from them.
+"""Compiled kernels: covariances of sightings whose parameters drift, and derived quantities.
 
 The whitened residual of sighting i is −Σ_p J_ip x_p(t_i) + noise. Each x_p is a constant with a
 variance, plus an offset that lasts for one regime, plus Ornstein-Uhlenbeck processes with given
@@ -208,7 +208,7 @@ def pooled_block(
 
 @njit(**OPTIONS)
 def step_sums(inverse, alpha, slope):
-    """Return sums over each sighting and all later ones: UᵀK⁻¹U (n, Z, Z) and UᵀK⁻¹r (n, Z).
+    """Return UᵀK⁻¹U (n, Z, Z) and UᵀK⁻¹r (n, Z), summed over each sighting and all later ones.
 
     ``slope`` (n, 2, Z) holds the derivatives with respect to the Z drive zeros, and U those of the
     sightings from k onwards.

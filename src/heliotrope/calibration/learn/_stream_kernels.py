@@ -52,7 +52,7 @@ def moments(weight, mean, covariance, first, amplitude, tau, days):
 
 @njit(**INNER)
 def reset(mean, covariance, k, variance):
-    """Forget what one hypothesis knows of component k, in place."""
+    """Reset component k of one hypothesis to its prior ``variance``, in place."""
     mean[k] = 0.0
     for j in range(mean.shape[0]):
         covariance[k, j] = 0.0
@@ -210,7 +210,7 @@ def update(
     weight, mean, covariance, regime, rows, value, noise, days, event,
     zeros, offsets, first, step, lost, amplitude, tau, chance, far
 ):  # fmt: skip
-    """Return the hypotheses of a heliostat after one more sighting, and its log density.
+    """Return a heliostat's hypotheses after one more sighting, and the sighting's log density.
 
     A hypothesis is a weight, a mean, a covariance and a regime.
 

@@ -493,7 +493,7 @@ class Posterior:
         return values, _no_less_than_nothing(covariances, own)
 
     def left_out(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Predict each sighting from the others.
+        """Predict each sighting from the other sightings of the heliostat.
 
         Returns z² (n,), the errors (n, 2) and their covariances (n, 2, 2).
         """

@@ -210,7 +210,7 @@ def repeatability(time: FloatArray, residual: FloatArray) -> float:
 def _by_heliostat(
     s: Sightings, used: npt.NDArray[np.bool_], count: int
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Return offsets (N + 1,) by heliostat, and used sightings in an input-independent order."""
+    """Return where each heliostat's used sightings begin, (N + 1,), and their order."""
     order = canonical_order(s)
     order = order[used[order]]
     return np.searchsorted(s.heliostat[order], np.arange(count + 1)), order
@@ -413,7 +413,7 @@ def _cut(
     task: Task,
     rows: npt.NDArray[np.intp],
 ) -> tuple[Mechanism, Sightings, npt.NDArray[np.bool_], Task, npt.NDArray[np.intp]]:
-    """Select heliostats ``rows`` of a field, with all that belongs to them.
+    """Select the heliostats ``rows`` of a field, with their sightings and options.
 
     Returns the mechanisms, the sightings with heliostat indices from 0, the mask of used sightings,
     the task, and the indices of the sightings in the field.

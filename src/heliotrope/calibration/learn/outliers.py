@@ -65,7 +65,7 @@ def generalised_esd(
 
 
 def left_out(inverse: FloatArray, alpha: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return each sighting's distance from the prediction of all others, and its variance.
+    """Return each sighting's distance from the prediction of all other sightings.
 
     ``inverse`` is K⁻¹ (2 n, 2 n), ``alpha`` K⁻¹ r (2 n,). Returns (z² (n,), error (n, 2),
     covariance (n, 2, 2)); z² is χ² with two degrees of freedom. (Rasmussen & Williams,
@@ -83,7 +83,7 @@ def left_out(inverse: FloatArray, alpha: FloatArray) -> tuple[FloatArray, FloatA
 def _remove_farthest(
     inverse: FloatArray, residual: FloatArray, most: int
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
-    """Remove the sighting that is farthest from the others, ``most`` times.
+    """Remove the sighting that is farthest from the remaining sightings, ``most`` times.
 
     Returns the indices of the removed sightings and their z², in the order of removal.
     """

@@ -182,7 +182,7 @@ def _scored(
 def _left_out(
     mechanism: Mechanism, s: Sightings, names: tuple[str, ...], mean: FloatArray
 ) -> FloatArray:
-    """Return the log density of each visit given the others, (V,), at the best noise."""
+    """Return the log density of each visit, given the other visits, (V,), at the best noise."""
     fitted = fit(mechanism, s, names)
     moved = mechanism.with_parameters(fitted.parameters)
     line = linearise(moved[s.heliostat], s, names)

@@ -241,7 +241,7 @@ def _known_ratios(mechanism: Mechanism) -> dict[int, float]:
 
 
 def arguments(drives: Drive, counts: FloatArray) -> FloatArray:
-    """Return x of each drive at its counts: the ideal angle, rad, or the stroke of a jack, m."""
+    """Return x for each drive: the ideal angle, rad, or the stroke of a jack, m."""
     t = drives.table
     moved = t[..., slot.RATE] * counts
     return np.asarray(np.where(t[..., slot.KIND] == slot.LINEAR, moved, t[..., slot.ZERO] + moved))

@@ -203,7 +203,7 @@ def hyper_of(
 
 
 def _applied(group: Hyperparameters, own: Hyperparameters) -> Hyperparameters:
-    """Return a heliostat's hyperparameters, replaced by its group's where both have them."""
+    """Return a heliostat's hyperparameters, replaced by the group's wherever the group has them."""
     mean, spread = own.mean.copy(), own.spread.copy()
     for p, name in enumerate(own.names):
         # A parameter that only drifts in one of the models has no population there.

@@ -28,7 +28,7 @@ CHUNK = 50
 
 
 def beliefs_of(learned: Learned) -> tuple[Belief, ...]:
-    """Return the belief of each heliostat after the sightings that it was learnt from.
+    """Return the belief of each heliostat after the sightings from which it was learnt.
 
     This is done overnight. The hyperparameters, the centre of the priors and the derivatives of
     past sightings come from the learnt field, with each sighting linearised about the posterior at

@@ -168,7 +168,7 @@ class _Exchange:
         return self._replace(o, i, rest)
 
     def _replace(self, o: int, i: int, rest: FloatArray) -> bool:
-        """Replace a beam of ``i`` by that of a heliostat that gains more from the slot."""
+        """Replace a beam of ``i`` by the beam of a heliostat that gains more from the slot."""
         rows = self.options[o].rows
         rows = rows[:: max(1, -(-len(rows) // PARTNERS))]
         new = [int(b) for b in rows if b != i and self.able(o, int(b))]

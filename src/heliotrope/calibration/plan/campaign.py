@@ -4,7 +4,8 @@ A target takes one beam at a time. Its time is divided into slots of equal lengt
 clear). There are two ways to plan. Either each day is planned as a whole, so that every heliostat
 is measured in its most informative hours as far as capacity allows. Or each slot is assigned to the
 heliostat whose sighting at that time reduces the field's expected squared beam error most.
-Heliostats slew while others are measured; each comes from its aim point and returns to it.
+Heliostats slew while other heliostats are measured; each comes from its aim point and returns to
+it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -312,7 +313,7 @@ class _Schedule:
                 self._fill(j, queue, begin, float(arrive), sun)
 
     def _fill(self, j: int, queue: "_Queue", begin: float, arrive: float, sun: FloatArray) -> None:
-        """Assign one slot of target ``j`` to the first heliostat in its queue that can be there."""
+        """Assign one slot of target ``j`` to the first queued heliostat that can be in place."""
         waiting: list[tuple[float, int, int]] = []
         while queue.heap:
             entry = heappop(queue.heap)

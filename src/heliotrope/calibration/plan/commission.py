@@ -517,7 +517,7 @@ class _Commissioning:
         return int((self._shines & self.visited & self.measured).sum())
 
     def _best(self, j: int, choices: _Choices, free: Mask) -> tuple[Rows, bool]:
-        """Return the heliostats of the next visit to a place, and whether it is a joint one."""
+        """Return the heliostats of the next visit to a place, and whether the visit is joint."""
         if j == len(self.targets) and (shining := self.terms.receiver) is not None:
             many = choices.known.first(free, shining.at_once(self._shining))
             return (many if len(many) >= shining.settings.least else many[:0]), True

@@ -68,7 +68,7 @@ def chance_by_try(
 
 
 def _cut(places: FloatArray, room: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the midpoints between window edges along an axis, and cell probabilities, (N, C)."""
+    """Return the midpoints of the cells along an axis, and the cell probabilities, (N, C)."""
     lines = np.unique(places)
     edges = np.sort(np.concatenate([lines - room[:, None], lines + room[:, None]], axis=1), axis=1)
     chance = 0.5 * np.diff(erf(edges / (np.sqrt(2.0) * sigma[:, None])), axis=1)

@@ -26,7 +26,7 @@ REGIMES = ("#0072b2", "#009e73", "#cc79a7", "#56b4e9", "#f0e442")
 def figure_of(
     rows: int, columns: int, size: tuple[float, float], *, fitted: bool = True
 ) -> tuple["Figure", Any]:
-    """Return a figure that needs no display, and its axes, ``fitted`` to the labels or not."""
+    """Return a figure that needs no display, and its axes; ``fitted`` makes room for labels."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

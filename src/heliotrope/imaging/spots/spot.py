@@ -162,8 +162,8 @@ def _core(soft: Image, owned: Mask, foot: float) -> Mask:
     neck = int(_NECK * breadth)
     if neck < 2:
         return np.asarray(core)
-    # Morphological opening by a disc keeps the pixels farther from the rim than its radius, and
-    # pixels near these.
+    # Morphological opening by a disc keeps the pixels farther from the rim than the disc's radius,
+    # and pixels near these.
     inner = cv2.distanceTransform(core.astype(np.uint8), cv2.DIST_L2, 5) <= neck
     opened = cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 5) <= neck
     _, labels = cv2.connectedComponents((core & opened | half).astype(np.uint8), connectivity=4)

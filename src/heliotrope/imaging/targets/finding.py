@@ -296,7 +296,7 @@ class _Face:
         return ""
 
     def _settled(self, attempt: Attempt, view: FaceView) -> Attempt:
-        """Return the attempt with the most marks, or the most upright one, of similar rotations."""
+        """Return the attempt with the most marks; of similar rotations, the most upright one."""
         search, up = self.search, self._up()
         middle = search.plane.mean(axis=0)
         scale = view.scale(middle)

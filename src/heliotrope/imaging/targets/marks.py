@@ -10,7 +10,7 @@ from heliotrope.geometry import FloatArray
 
 
 def polygons(mark: Mark) -> list[FloatArray]:
-    """Return the dark polygons of a mark, metres to the right of and above its point, each (K, 2).
+    """Return the dark polygons of a mark, (K, 2) each, m right of and above the mark's point.
 
     Raises
     ------

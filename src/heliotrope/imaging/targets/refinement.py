@@ -164,7 +164,7 @@ def locate(
     search: float,
     picture: FloatArray | None = None,
 ) -> tuple[FloatArray, float, float] | None:
-    """Return a mark's approximate position, (2,), its standard deviation, px, and correlation.
+    """Return a mark's approximate position, px, (2,), its sigma, px, and its correlation.
 
     The parameters are those of `refine`; the result is None if the mark is not found.
     """
@@ -275,7 +275,7 @@ def _sample(
     step: float,
     shape: tuple[int, int],
 ) -> tuple[Values, npt.NDArray[np.bool_] | None] | None:
-    """Sample a frame on a grid of the plane; return it, and a mask of the cells in the frame.
+    """Return a frame sampled on a grid of the plane, and a mask of the cells in the frame.
 
     The mask is None if all cells are in the frame, and the result is None if most of the grid is
     outside. Pixels finer than the grid are averaged first.
