@@ -321,7 +321,7 @@ def _beyond_machine(
 def _reach(
     mirrors: Mechanism, counts: FloatArray, drive: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, str]:
-    """Return a drive's values, lower and upper limits, tolerance for its zero, and unit.
+    """Return a drive's values, its two limits, the tolerance for its zero, and the unit.
 
     All have shape (M,), in counts if the drive has count limits, otherwise in degrees.
     """

@@ -479,7 +479,7 @@ def _empty(cell: Any) -> bool:
 
 
 def check_names(what: str, names: Iterable[str]) -> None:
-    """Reject empty names, and names that count as the same.
+    """Reject empty names, and names that count as equal.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Annotates a photograph with its evaluation."""
+"""Annotate a photograph with its evaluation."""
 
 import numpy as np
 

@@ -86,7 +86,7 @@ class Job:
 
     @property
     def trust(self) -> str:
-        """One-line warning if frames cannot show whether they are mirrored; empty if they can."""
+        """One-line warning if frames cannot show whether they are mirrored; otherwise empty."""
         if self.crop:
             cause = "a crop shows one target without its surroundings"
         elif self.camera is not None and self.camera.position is not None:

@@ -237,12 +237,12 @@ class Proof:
 
 
 def proof_readings(proof: Proof | None, now: float) -> dict[tuple[str, str], Reading]:
-    """Return the safety-table readings that follow from a proof; None means no emergency.
+    """Return the safety-table readings that an emergency order's record implies.
 
-    ``nodes_unacknowledged`` is 0 until the acknowledgement deadline, then the number of heliostats
-    that have not acknowledged. ``flux_after_emergency`` is 0 until the defocus deadline, then the
-    flux as a fraction of the nominal flux, or 1 if its sensor is silent; it stays 0 if no sensor
-    supplies it.
+    ``proof`` is None if there is no emergency. ``nodes_unacknowledged`` is 0 until the
+    acknowledgement deadline, then the number of heliostats that have not acknowledged.
+    ``flux_after_emergency`` is 0 until the defocus deadline, then the flux as a fraction of the
+    nominal flux, or 1 if its sensor is silent; it stays 0 if no sensor supplies it.
     """
     silent, flux = 0.0, 0.0
     if proof is not None:

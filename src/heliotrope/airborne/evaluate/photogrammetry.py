@@ -312,7 +312,7 @@ def _result(state: _State, made: Photogrammetry, normal: FloatArray) -> Photogra
 
 
 def relative(position: FloatArray) -> FloatArray:
-    """Return the matrix (3P, 3P) that removes the best similarity transform from displacements.
+    """Return the matrix (3P, 3P) that removes the best similarity transform of displacements.
 
     What remains of P displacements is the part that no common shift (3), rotation (3) or scale (1)
     explains.

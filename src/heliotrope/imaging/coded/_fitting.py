@@ -86,7 +86,7 @@ def axes_of(moves: FloatArray) -> npt.NDArray[np.intp]:
 
 
 def code_of(moves: FloatArray) -> npt.NDArray[np.intp]:
-    """Return the first heliostat with the same code as each, (M,), for moves (K, M, 2).
+    """Return, for each heliostat, the first heliostat with the same code, (M,).
 
     Heliostats share a code if their movements are proportional, with one positive factor per axis.
     """
@@ -180,7 +180,7 @@ def fitted(
 
 
 def _beside(points: FloatArray, place: FloatArray) -> FloatArray:
-    """Return how far a position lies outside points (N, 2) along each axis, m, (2,)."""
+    """Return how far a position is outside points (N, 2) on each axis, m, (2,); ≤ 0 if inside."""
     return np.asarray(np.maximum(points.min(axis=0) - place, place - points.max(axis=0)))
 
 

@@ -51,7 +51,7 @@ class Separation:
 
     @property
     def proven(self) -> tuple[SeparatedBeam, ...]:
-        """Beams with the verdict that lets them become sightings."""
+        """Beams whose verdict allows them to become sightings."""
         return tuple(beam for beam in self.beams if beam.verdict is Verdict.PROVEN)
 
 

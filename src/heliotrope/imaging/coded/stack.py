@@ -68,7 +68,7 @@ class Stack:
 
     @property
     def axes(self) -> tuple[FloatArray, FloatArray]:
-        """Positions of columns right of, (W,), and of rows above the centre, (H,), m."""
+        """Column positions right of the centre, m, (W,), and row positions above it, m, (H,)."""
         _, rows, columns = self.values.shape
         return (
             self.first[0] + self.step * np.arange(columns),

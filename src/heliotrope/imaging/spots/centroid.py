@@ -1,4 +1,4 @@
-"""User-defined centroids: from the picture of a beam to its position and covariance."""
+"""User-defined centroid functions, which convert the picture of a beam to its position."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

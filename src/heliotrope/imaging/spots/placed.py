@@ -1,4 +1,4 @@
-"""The position of a spot on its target, with the covariance of spot, view and survey."""
+"""Position of a spot on its target, with the covariance due to spot, view and survey."""
 
 from dataclasses import dataclass
 
