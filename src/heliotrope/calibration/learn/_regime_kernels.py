@@ -61,7 +61,10 @@ def _segment(residual, jacobian, start, stop, shift):
 
 @njit(**OPTIONS)
 def partition(residual, jacobian, places, smallest):
-    """Return labels (n,) of the best partition of sightings (n, 2), with cuts at ``places``."""
+    """Return labels (n,) of the best partition of sightings (n, 2), with cuts at ``places``.
+
+    Label 0 marks all sightings with the common zeros; the other labels count from 1.
+    """
     n, count = len(residual), len(places)
     plain = np.zeros(n + 1)
     for i in range(n):
