@@ -9,7 +9,7 @@ measurements, and corrects them. In a notebook::
     sun = ht.sun.vector("2026-09-02T10:00Z", plant.site)
 
 A name is loaded when it is first used, so the import itself is fast. The names below are the usual
-entry points; each package (`heliotrope.mechanism`, `heliotrope.optics`, …) has more.
+entry points; each package (`heliotrope.mechanism`, `heliotrope.optics`, …) contains more.
 """
 
 from importlib import import_module
@@ -137,14 +137,14 @@ _HOMES = {
     "write_report": "heliotrope.calibration",
     "write_sightings": "heliotrope.calibration",
 }
-#: Public names that are shorter than the names in their modules.
+#: Public names that differ from the names in their modules.
 _SHORT = {
     "aim": "plan_aims",
     "compare": "compare_models",
     "flux": "field_flux",
     "open": "open_plant",
 }
-#: Names that stand for a whole module.
+#: Public names that stand for a whole module.
 _MODULES = {
     "aims": "heliotrope.aims",
     "geometry": "heliotrope.geometry",
@@ -218,7 +218,7 @@ __all__ = [
     "write_solarpilot",
 ]
 
-# Hidden from type checkers, because with it they would accept every misspelt name.
+# `__getattr__` is hidden from type checkers, because it would make them accept every misspelt name.
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:

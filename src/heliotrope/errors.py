@@ -23,13 +23,13 @@ _LONGEST = 60
 
 
 def shown(value: object) -> str:
-    """Return a value as an error message quotes it: on one line, shortened if need be."""
+    """Return a value as error messages quote it, on one line and shortened if necessary."""
     text = " ".join(repr(value).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
 def kind_of(value: object) -> str:
-    """Return the type of a value as an error names it: "a heliotrope Plant", "a pvlib Location"."""
+    """Return the type of a value as errors name it: "a heliotrope Plant", "a pvlib Location"."""
     package, name = type(value).__module__.partition(".")[0], type(value).__name__
     text = name if package == "builtins" else f"{package} {name}"
     return f"{'an' if text[0].lower() in 'aeiou' else 'a'} {text}"
@@ -40,7 +40,7 @@ _DOUBLED = re.compile(r"\b(receiver|target|camera|cluster|sensor|heliostat|group
 
 
 def once(text: str) -> str:
-    """Return the text with repeated kinds removed, so that no error says "receiver receiver"."""
+    """Return a text without repeated kinds, so that no error says "receiver receiver"."""
     return _DOUBLED.sub(r"\1", text)
 
 
@@ -91,7 +91,7 @@ class TimeError(InputError):
 
 
 class UnknownNameError(InputError, KeyError):
-    """A name that is not in the collection it was looked up in."""
+    """A name that is not in the collection in which it was looked up."""
 
     def __init__(self, what: str, name: str, known: Iterable[str]) -> None:
         self.name = name
@@ -111,4 +111,4 @@ class UnknownNameError(InputError, KeyError):
 
 
 class FetchError(HeliotropeError):
-    """A download that could not be completed; what is already there is kept."""
+    """A download that could not be completed; files already downloaded are kept."""

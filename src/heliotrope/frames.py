@@ -1,6 +1,6 @@
-"""Array records as tables and as labelled arrays: pandas and xarray.
+"""Convert array records to tables (pandas) and to labelled arrays (xarray).
 
-A class declares once which axes its arrays have (`Labelled`); the data frame and the dataset are
+A class declares once which axes its arrays have (`Labelled`). The data frame and the dataset are
 built from this declaration. Units are stored in ``attrs``: for each variable of a dataset
 (``units``), and for a frame in ``frame.attrs["units"]`` by column. Times are UTC.
 """
@@ -28,7 +28,7 @@ ACROSS = ("right", "up")
 
 @dataclass(frozen=True)
 class Variable:
-    """An array with its axis names and its unit ("" for none) or the units along its last axis."""
+    """An array with its axis names, and its unit ("" for none) or units along the last axis."""
 
     axes: tuple[str, ...]
     values: npt.ArrayLike
@@ -47,11 +47,11 @@ class Labelled:
     Attributes
     ----------
     rows
-        The axes that make the rows of a frame; the others become columns.
+        The axes that become the rows of a frame; the other axes become columns.
     labels
         Labels along each axis.
     variables
-        By name.
+        Variables, keyed by name.
     large
         Variables that only the dataset has, because a frame would need too many columns for them.
     notes
@@ -76,13 +76,13 @@ class Framed:
         """Return the arrays with their axes."""
 
     def to_frame(self, *, full: bool = False) -> "pd.DataFrame":
-        """Return a pandas frame with one row for each label; ``attrs["units"]`` holds units.
+        """Return a pandas frame with one row for each label; ``attrs["units"]`` has the units.
 
         Parameters
         ----------
         full
-            Whether a fit has the columns ``prior_…`` and ``centre_…`` too; other records have the
-            same columns either way.
+            Whether to include the columns ``prior_…`` and ``centre_…`` of a fit. For other records
+            it makes no difference.
         """
         import pandas as pd
 
@@ -118,7 +118,7 @@ class Framed:
         return frame
 
     def to_xarray(self) -> "xr.Dataset":
-        """Return an xarray dataset, which ``to_netcdf`` writes; needs the extra ``notebook``."""
+        """Return an xarray dataset; this needs the optional extra ``notebook``."""
         try:
             import xarray
         except ImportError:
@@ -158,7 +158,7 @@ def batched(
     own
         Arrays by name, with the axes that follow the batch axes.
     labels
-        Labels of these axes.
+        Labels along these axes.
     large
         As in `Labelled`.
     """
@@ -174,7 +174,7 @@ def batched(
     return Labelled(tuple(rows), {**rows, **labels}, variables, large)
 
 
-#: Largest distance from 1970 that fits into a frame's nanosecond times, s.
+#: Largest distance from 1970 that the nanosecond times of a frame can represent, s.
 LATEST = 9.2e9
 
 

@@ -1,8 +1,8 @@
 """Vectors, rotations and frames.
 
-Frame: ENU (x east, y north, z up), metres, right-handed. Azimuth is clockwise from north in [0,
-2π), elevation is above the horizon. Arrays have their batch axes first and the vector axis last,
-``(..., 3)``.
+The frame is ENU (x east, y north, z up), right-handed, in metres. Azimuth is clockwise from north
+in [0, 2π), elevation is above the horizon. Arrays have their batch axes first and the vector axis
+last, ``(..., 3)``.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from heliotrope.errors import InputError, shown
 FloatArray = npt.NDArray[np.float64]
 
 TAU = 2.0 * np.pi
-#: Largest angle accepted, rad: four turns. A larger number is probably in degrees.
+#: Largest accepted angle, rad: four turns. A larger number is probably in degrees.
 MOST_TURNS = 4.0 * TAU
 #: One milliradian, so that tolerances can be written as ``0.01 * MRAD``.
 MRAD = 1e-3
@@ -37,12 +37,12 @@ def as_numbers(
 ) -> FloatArray:
     """Return ``value`` as an array of numbers that lie within ``low`` and ``high``.
 
-    Infinity passes only where the limit itself is infinite; NaN never passes.
+    Infinity is accepted only if the limit itself is infinite; NaN is never accepted.
 
     Parameters
     ----------
     value
-        Of any shape.
+        Numbers of any shape.
     name, unit
         Name and unit of the value for the error message.
     low, high
@@ -74,7 +74,7 @@ def as_numbers(
 
 
 def as_angles(value: npt.ArrayLike, name: str, limit: float) -> FloatArray:
-    """Return ``value`` as angles in radians of at most ``limit``, which most degree values exceed.
+    """Return ``value`` as angles in rad of at most ``limit``, which most degree values exceed.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def as_vectors(value: npt.ArrayLike, name: str) -> FloatArray:
 
 
 def common_shape(**arrays: FloatArray) -> tuple[int, ...]:
-    """Return the shape that the named arrays broadcast to; the error message quotes the names.
+    """Return the shape to which named arrays broadcast; the error message quotes the names.
 
     Raises
     ------
@@ -116,12 +116,12 @@ def common_shape(**arrays: FloatArray) -> tuple[int, ...]:
 
 
 def common_batch(shapes: Mapping[str, tuple[int, ...]]) -> tuple[int, ...]:
-    """Return the shape that these batch shapes broadcast to.
+    """Return the shape to which these batch shapes broadcast.
 
     Raises
     ------
     InputError
-        If they do not broadcast together; the message names one array of each shape.
+        If the shapes do not broadcast together; the message names one array of each shape.
     """
     try:
         return np.broadcast_shapes(*shapes.values())
@@ -142,7 +142,7 @@ def normalize(vectors: npt.ArrayLike, name: str = "vector") -> FloatArray:
     Parameters
     ----------
     vectors
-        Shape (..., 3), any non-zero length.
+        Vectors of any non-zero length, (..., 3).
     name
         Name of the vectors for the error message.
 
@@ -152,7 +152,7 @@ def normalize(vectors: npt.ArrayLike, name: str = "vector") -> FloatArray:
         If a vector is zero or not finite.
     """
     array = as_vectors(vectors, name)
-    # Scaling by the largest component keeps the digits of tiny and huge vectors.
+    # Scaling by the largest component preserves the precision of tiny and huge vectors.
     largest = np.abs(array).max(axis=-1, keepdims=True, initial=0.0)
     if (largest == 0.0).any():
         raise InputError(f"{name}: a vector of length 0 has no direction; pass a nonzero vector")
@@ -176,8 +176,8 @@ def rotation(axis: npt.ArrayLike, angle: npt.ArrayLike) -> FloatArray:
     Parameters
     ----------
     axis
-        Shape (..., 3); need not be of unit length. A zero axis yields the identity, and so stands
-        for a missing second axis.
+        Axes, (..., 3), which need not be of unit length. A zero axis yields the identity, and
+        therefore represents a missing second axis.
     angle
         Radians, shape (...).
 
@@ -190,7 +190,7 @@ def rotation(axis: npt.ArrayLike, angle: npt.ArrayLike) -> FloatArray:
     unit = np.divide(a, length, out=np.zeros_like(a), where=length > 0)
     theta = as_float(angle)[..., None, None]
     k = cross_matrix(unit)
-    # 2 sin²(θ/2) keeps the digits of 1 − cos θ at small angles.
+    # 2 sin²(θ/2) preserves the precision of 1 − cos θ at small angles.
     return np.eye(3) + np.sin(theta) * k + 2.0 * np.sin(0.5 * theta) ** 2 * (k @ k)
 
 
@@ -214,7 +214,7 @@ def direction(azimuth: npt.ArrayLike, elevation: npt.ArrayLike) -> FloatArray:
 def azimuth_elevation(vectors: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Return azimuth in [0, 2π) and elevation in [−π/2, π/2] of vectors (..., 3).
 
-    The elevation comes from atan2 and so keeps its digits near the zenith. At the
+    The elevation is computed with atan2, which preserves its precision near the zenith. At the
     zenith itself the azimuth is 0.
     """
     v = as_float(vectors)
@@ -239,8 +239,8 @@ def wrap_signed(angle: npt.ArrayLike) -> FloatArray:
 def angle_between(a: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray:
     """Return the angle between unit vectors (..., 3) in radians, exact near 0 and π.
 
-    Kahan's formula 2·atan2(|a − b|, |a + b|); arccos of the scalar product loses
-    half of the digits for small angles.
+    The formula is Kahan's, 2·atan2(|a − b|, |a + b|); arccos of the scalar product loses half of
+    the digits for small angles.
     """
     u, v = as_float(a), as_float(b)
     return as_float(
@@ -251,8 +251,8 @@ def angle_between(a: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray:
 def bisector(source: npt.ArrayLike, destination: npt.ArrayLike) -> FloatArray:
     """Return the unit normal that sends light from ``source`` towards ``destination``.
 
-    Law of reflection: n ∥ s + t, where s and t are unit vectors (..., 3) that point away from the
-    mirror.
+    The law of reflection is n ∥ s + t, where s and t are unit vectors (..., 3) that point away from
+    the mirror.
 
     Raises
     ------
@@ -277,8 +277,8 @@ def reflect(direction_in: npt.ArrayLike, normal: npt.ArrayLike) -> FloatArray:
 def tangent_axes(normals: npt.ArrayLike) -> FloatArray:
     """Return two unit axes perpendicular to each normal, shape (..., 2, 3).
 
-    The first is horizontal (to the right of someone looking along the normal), the
-    second points up; for a vertical normal they are east and north.
+    The first axis is horizontal, to the right as seen by an observer looking along the normal, and
+    the second axis points up. For a vertical normal the two axes are east and north.
     """
     n = as_float(normals)
     horizontal = np.stack([n[..., 1], -n[..., 0], np.zeros(n.shape[:-1])], axis=-1)
@@ -310,8 +310,8 @@ def geodetic_to_enu(
 ) -> FloatArray:
     """Return WGS84 positions as ENU metres (..., 3) about ``origin``.
 
-    Exact (geodetic to Earth-centred to local); a linearised conversion is 3 mm off
-    at 210 m. ``origin`` is latitude and longitude in degrees and height in metres.
+    The conversion is exact (geodetic to Earth-centred to local); a linearised conversion is 3 mm
+    off at 210 m. ``origin`` is latitude and longitude in degrees, and height in metres.
     """
     import pymap3d
 

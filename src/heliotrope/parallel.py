@@ -1,8 +1,8 @@
-"""Splits independent rows across threads.
+"""Split independent rows across threads.
 
 The numeric kernels are compiled with ``nogil`` and treat every row (heliostat, time) independently,
 so contiguous blocks of rows can run on as many threads as there are cores. The result does not
-depend on the number of threads, because no row reads what another writes.
+depend on the number of threads, because no row reads what another row writes.
 """
 
 import os
@@ -44,16 +44,16 @@ def _pool(workers: int) -> ThreadPoolExecutor:
 def run_blocks(
     kernel: Callable[[int, int], None], rows: int, minimum_rows: int = MINIMUM_ROWS
 ) -> None:
-    """Call ``kernel(start, stop)`` so that the blocks together cover ``range(rows)``.
+    """Call ``kernel(start, stop)`` for blocks that together cover ``range(rows)``.
 
     Parameters
     ----------
     kernel
-        Writes rows ``start`` to ``stop`` of its outputs and nothing else.
+        Function that writes rows ``start`` to ``stop`` of its outputs and nothing else.
     rows
         Number of rows.
     minimum_rows
-        Fewer rows than this stay on the calling thread.
+        With fewer rows than this, the kernel runs on the calling thread.
     """
     workers = threads()
     if workers == 1 or rows < minimum_rows:

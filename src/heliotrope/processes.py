@@ -1,4 +1,4 @@
-"""Child processes that end when this process ends, for whatever reason, and yield the CPU to it."""
+"""Child processes that end when this process ends, for whatever reason, and give way to it."""
 
 import contextlib
 import os
@@ -13,9 +13,9 @@ def pool(processes: int, niceness: int | None = None) -> ProcessPoolExecutor:
     """Return a pool of freshly started processes that end when this process ends.
 
     The processes are not forked, because a forked child would inherit the locks of this process's
-    threads. They end even if this process is killed; otherwise they would wait for work for ever.
-    With a ``niceness`` they compute beside a running plant: they give way to it from their first
-    import on, use one thread each and ignore Ctrl-C in its terminal.
+    threads. They end even if this process is killed; otherwise they would wait for ever for work.
+    With a ``niceness`` they can run beside a plant. They then give way to the plant from their
+    first import on, use one thread each and ignore Ctrl-C in its terminal.
     """
     return ProcessPoolExecutor(
         processes,
@@ -26,7 +26,7 @@ def pool(processes: int, niceness: int | None = None) -> ProcessPoolExecutor:
 
 
 def give_way(niceness: int) -> None:
-    """Let this process use only the CPU time that others leave, where the system allows that."""
+    """Let this process use only the CPU time that others leave, if the system permits it."""
     # A systemd unit may deny the call; then all processes have equal priority.
     with contextlib.suppress(OSError):
         os.nice(niceness)
@@ -34,7 +34,7 @@ def give_way(niceness: int) -> None:
 
 def end(pool: ProcessPoolExecutor) -> None:
     """End a pool at once and discard its unfinished work."""
-    # Python 3.14 has kill_workers for this.
+    # From Python 3.14 on, kill_workers does this.
     running = list((pool._processes or {}).values())  # noqa: SLF001
     pool.shutdown(wait=False, cancel_futures=True)
     for process in running:

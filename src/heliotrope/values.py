@@ -1,7 +1,7 @@
-"""Common base of array records: comparison by content, display on one line or as a table.
+"""Common base of array records: comparison by content, and display as a line or a table.
 
-A class provides a `Card`: one line for ``repr``, and a table with units and a small plot for a
-notebook. Both stay short, whatever the size of the arrays.
+Each class provides a `Card`, with one line for ``repr``, and a table with units and a small plot
+for a notebook. Both are short, whatever the size of the arrays.
 """
 
 from abc import abstractmethod
@@ -30,9 +30,9 @@ class Card:
     line
         One line, without the name of the class.
     header, rows
-        Table with units; empty for none.
+        Table with units; empty for no table.
     picture
-        SVG, as `dots` draws it; "" for none.
+        SVG as drawn by `dots`; "" for no picture.
     """
 
     line: str
@@ -115,7 +115,7 @@ def amount(count: int, noun: str) -> str:
 
 
 def dots(x: npt.ArrayLike, y: npt.ArrayLike, title: str) -> str:
-    """Return a small SVG of points, x to the right and y upwards, at one scale.
+    """Return a small SVG of points, x to the right and y upwards, to the same scale.
 
     At most `MOST_DOTS` evenly spaced points are drawn.
     """
@@ -128,7 +128,7 @@ def dots(x: npt.ArrayLike, y: npt.ArrayLike, title: str) -> str:
     low, high = points.min(axis=0), points.max(axis=0)
     scale = (_SIZE - 2.0 * _MARGIN) / max(float((high - low).max()), 1e-9)
     place = 0.5 * _SIZE + scale * (points - 0.5 * (low + high)) * np.array([1.0, -1.0])
-    # A line of length 0 with round ends is a dot.
+    # A line of length 0 with round ends appears as a dot.
     path = "".join(f"M{a:.0f} {b:.0f}h0" for a, b in place)
     return (
         f'<svg width="{_SIZE:.0f}" height="{_SIZE:.0f}" role="img">'

@@ -1,9 +1,9 @@
 """Compile the numeric kernels once, so that programs start at full speed.
 
-After an installation ``python -m heliotrope.warm`` takes some twenty seconds on two cores, and
-about a second on later runs; the compiled code is stored in the package's ``__pycache__``. The
-compiler uses one thread, so the kernels are divided between two processes. Commands that need most
-kernels begin with `compiling`.
+After an installation, ``python -m heliotrope.warm`` takes some twenty seconds on two cores; later
+runs take about a second. The compiled code is stored in the package's ``__pycache__``. The compiler
+uses one thread, so the kernels are divided between two processes. Commands that need most kernels
+begin with `compiling`.
 """
 
 import subprocess
@@ -24,7 +24,7 @@ OTHER_HALF = "other-half"
 
 
 def main() -> None:
-    """Run the kernels of tracking and learning once, in two processes where there are two cores."""
+    """Run the kernels of tracking and learning once, in two processes if there are two cores."""
     if OTHER_HALF in sys.argv[1:]:
         fitting()
         return
@@ -37,12 +37,12 @@ def main() -> None:
 
 @contextmanager
 def compiling() -> Iterator[None]:
-    """Compile the kernels of a calibration, in two processes, unless they are compiled.
+    """Compile the kernels of a calibration in two processes, unless they are already compiled.
 
-    Tracking is compiled when the block begins, fitting when it ends. With one core, or where
-    machine code cannot be kept, kernels are compiled when they are needed. The halves take equally
-    long if tracking comes last, because by then the other process has compiled and cached the joint
-    chain, which both need.
+    Tracking is compiled when the block begins, and fitting when it ends. With one core, or where
+    machine code cannot be stored, kernels are compiled when they are needed. Both halves take
+    equally long if tracking comes last, because the other process has by then compiled and cached
+    the joint chain, which both halves need.
     """
     from heliotrope.calibration.fit import estimator
 
@@ -50,7 +50,7 @@ def compiling() -> Iterator[None]:
         yield
         return
     command = [sys.executable, "-m", "heliotrope.warm", OTHER_HALF]
-    # A fault in the other process occurs in this one too, where it is reported.
+    # An error in the other process also occurs in this process, where it is reported.
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL):  # noqa: S603
         searching()
         breaking()
@@ -65,7 +65,7 @@ def controlling() -> None:
 
 
 def computing() -> None:
-    """Load the kernels that the processes beside a plant's loop use."""
+    """Load the kernels that processes beside a plant's loop use."""
     from heliotrope.imaging import coded, photograph  # noqa: F401 - only loaded
 
     tracking()
@@ -73,7 +73,7 @@ def computing() -> None:
 
 
 def tracking() -> None:
-    """Track a heliostat."""
+    """Track one heliostat, which compiles the tracking kernels."""
     from heliotrope.mechanism.tracking import track
 
     mechanism, seen = _case()
@@ -82,7 +82,7 @@ def tracking() -> None:
 
 
 def fitting() -> None:
-    """Place a heliostat and fit its model."""
+    """Place a heliostat and fit its model, which compiles the kernels for these."""
     from heliotrope.calibration.fit.estimator import fit
 
     mechanism, seen = _case()

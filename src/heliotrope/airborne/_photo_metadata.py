@@ -1,4 +1,4 @@
-"""EXIF and XMP metadata as DJI drones write them into photographs, read and written."""
+"""Read and write EXIF and XMP metadata as DJI drones write them into photographs."""
 
 import math
 import struct
@@ -15,7 +15,7 @@ from heliotrope.geometry import FloatArray
 DJI = "http://www.dji.com/drone-dji/1.0/"
 _RDF = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
 _XAP = "http://ns.adobe.com/xap/1.0/"
-#: RtkFlag of a fixed solution; lower values mean decimetres or metres.
+#: RtkFlag of a fixed solution; lower values mean an accuracy of decimetres or metres.
 RTK_FIXED = 50
 _EXIF_IFD, _TAKEN, _OFFSET, _SUBSECOND = 0x8769, 0x9003, 0x9011, 0x9291
 
@@ -29,15 +29,16 @@ class Metadata:
     size
         Width and height, pixels.
     time
-        UTC, if the file states the time zone.
+        Time of exposure, in UTC if the file states the time zone.
     latitude_deg, longitude_deg, altitude
-        Position of the projection centre; the altitude in m.
+        Position of the projection centre, with the altitude in m.
     yaw_deg, pitch_deg, roll_deg
         Angles of the gimbal.
     sigma
-        Standard deviations east, north, up stated by the RTK receiver, m, (3,).
+        Standard deviations to the east, to the north and up, as stated by the RTK receiver, m,
+        (3,).
     rtk_flag
-        `RTK_FIXED` for a fixed solution; None if the file has none.
+        `RTK_FIXED` for a fixed solution; None if the file has no flag.
     """
 
     size: tuple[int, int]
@@ -58,18 +59,18 @@ class Metadata:
 
 
 def read_metadata(path: str | Path) -> Metadata:
-    """Return the metadata of a JPEG's header; the pixels are not decoded.
+    """Return the metadata in the header of a JPEG file, without decoding the pixels.
 
     Raises
     ------
     FormatError
-        If it is not an image, or its XMP is damaged.
+        If the file is not an image, or its XMP is damaged.
     """
     from PIL.JpegImagePlugin import jpeg_factory
 
     file = Path(path)
     try:
-        # Not Image.open, because its pixel limit applies to the whole process.
+        # Image.open is avoided, because its pixel limit applies to the whole process.
         with file.open("rb") as stream, jpeg_factory(stream) as image:
             size, packet, exif = image.size, image.info.get("xmp", b""), image.getexif()
             tags = dict(exif.get_ifd(_EXIF_IFD))
@@ -107,7 +108,7 @@ def read_metadata(path: str | Path) -> Metadata:
 
 
 def _xmp(file: Path, packet: bytes | str) -> dict[str, str]:
-    """Return DJI's values and the creation date by name, from attributes or elements."""
+    """Return DJI's values and the creation date by name, from XML attributes or elements."""
     from lxml import etree
 
     data = packet.encode() if isinstance(packet, str) else packet
@@ -147,7 +148,7 @@ def _time(values: dict[str, str], tags: dict[int, object]) -> datetime | None:
 
 
 def exif_and_xmp(metadata: Metadata) -> tuple[bytes, bytes]:
-    """Return the EXIF block and the XMP packet that state ``metadata``."""
+    """Return an EXIF block and an XMP packet that contain ``metadata``."""
     from PIL import Image
 
     exif = Image.Exif()

@@ -1,8 +1,8 @@
-"""Coded targets on the ground, from which photogrammetry locates the drone (appendix A).
+"""Coded targets on the ground, with which photogrammetry locates the drone (appendix A).
 
 A target is a black square with a pattern that encodes its number (OpenCV's ArUco, dictionary 4×4,
-250 numbers), on a white sheet whose margin is one cell wide. Its four outer corners are measured;
-its position need not be known.
+250 numbers), on a white sheet whose margin is one cell wide. Its four outer corners are measured in
+the photographs; the position of the target need not be known.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from heliotrope.geometry import FloatArray, as_float
 
 #: Number of different targets, and cells across the black square.
 NUMBERS, CELLS = 250, 6
-#: White margin of the sheet, cells.
+#: Width of the white margin of the sheet, cells.
 MARGIN = 1
 
 
@@ -27,7 +27,7 @@ class CodedTarget:
     Attributes
     ----------
     number
-        0 to 249.
+        Number of the target, 0 to 249.
     corners
         Corners of the black square, ENU metres: upper left, upper right, lower right, lower left
         of the pattern, (4, 3).
@@ -37,7 +37,7 @@ class CodedTarget:
     corners: FloatArray
 
     def at(self, u: npt.ArrayLike, v: npt.ArrayLike) -> FloatArray:
-        """Return points of the sheet, cells right and down of the upper left corner, (..., 3)."""
+        """Return points of the sheet, (..., 3), at cells right and down of its top left corner."""
         a, b = as_float(u)[..., None] / CELLS, as_float(v)[..., None] / CELLS
         start = self.corners[0]
         right, down = self.corners[1] - start, self.corners[3] - start
@@ -46,12 +46,12 @@ class CodedTarget:
 
 @lru_cache(maxsize=NUMBERS)
 def white_cells(number: int) -> npt.NDArray[np.bool_]:
-    """Return the mask of white cells of the black square, (CELLS, CELLS), rows from the top.
+    """Return a mask of the white cells of the black square, (CELLS, CELLS), rows from the top.
 
     Raises
     ------
     InputError
-        If there is no such number.
+        If there is no target with that number.
     """
     import cv2
 
@@ -64,14 +64,14 @@ def white_cells(number: int) -> npt.NDArray[np.bool_]:
 def square_target(
     number: int, center: npt.ArrayLike, side: float, right: npt.ArrayLike, down: npt.ArrayLike
 ) -> CodedTarget:
-    """Return a target of a side (m) with its middle at ``center``, along unit vectors (3,)."""
+    """Return a target with sides of ``side`` m along unit vectors (3,), centred at ``center``."""
     half = 0.5 * side
     x, y = half * as_float(right), half * as_float(down)
     return CodedTarget(number, as_float(center) + np.stack([-x - y, x - y, x + y, y - x]))
 
 
 def target_sheet(number: int, side_mm: float) -> str:
-    """Return a printable sheet as SVG in millimetres, whose black square has the given side."""
+    """Return a printable sheet as SVG, in mm, whose black square has sides of ``side_mm``."""
     cell = side_mm / CELLS
     whole = side_mm + 2 * MARGIN * cell
     rows, columns = np.nonzero(white_cells(number))

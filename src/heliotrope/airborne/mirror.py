@@ -37,9 +37,9 @@ IntArray = npt.NDArray[np.intp]
 
 # Cells along an edge of a facet without slope map.
 _CELLS = 4
-# Nodes processed together: tens of megabytes.
+# Number of nodes processed together, which takes tens of megabytes.
 _BLOCK = 400_000
-# Allowed difference of g from its bilinear form, as a share of its range in the cell.
+# Allowed difference of g from its bilinear form, as a fraction of its range in the cell.
 _MARGIN = 0.05
 _ITERATIONS = 30
 
@@ -55,12 +55,12 @@ class MirrorShape:
     half_width, half_height
         Vectors from the centre of a facet to the midpoints of its right and upper edges, m, (F, 3).
     focal
-        Focal lengths of the facets, m, (F,); inf if flat.
+        Focal lengths of the facets, m, (F,); inf for flat facets.
     slope
         Deviations ∂z/∂u and ∂z/∂v from the slopes of that surface along each facet's own right and
-        upward edges, rad, (F, H, W, 2), or None. Row 0 is at the lower edge, column 0 at the left
-        edge; values are at the centres of the H × W cells, with bilinear interpolation. A positive
-        ∂z/∂u tilts the normal to the left.
+        upward edges, rad, (F, H, W, 2); None if there is no slope map. Row 0 is at the lower edge
+        and column 0 at the left edge; values are at the centres of the H × W cells, with bilinear
+        interpolation. A positive ∂z/∂u tilts the normal to the left.
     """
 
     center: FloatArray
@@ -102,12 +102,12 @@ class MirrorShape:
 
     @property
     def facets(self) -> Facets:
-        """The facets of this one mirror, as a plant has them."""
+        """The facets of this mirror, in the form used in a plant."""
         return Facets(self.center[None], self.half_width[None], self.half_height[None])
 
     @cached_property
     def axes(self) -> FloatArray:
-        """Each facet's unit axes right, up and outwards, as rows, (F, 3, 3)."""
+        """Unit axes of each facet to the right, up and outwards, as rows, (F, 3, 3)."""
         return as_float(self.facets.axes[0])
 
     @cached_property
@@ -144,7 +144,7 @@ class MirrorShape:
         )
 
     def on_facet(self, facet: npt.ArrayLike, uv: npt.ArrayLike) -> FloatArray:
-        """Return the surface points at (K, 2) m along the axes of ``facet`` (K,): (K, 3)."""
+        """Return the surface points (K, 3) at ``uv`` (K, 2), m, on the axes of ``facet`` (K,)."""
         k, own = np.asarray(facet, dtype=np.intp), as_float(uv)
         high = np.sum(own**2, axis=-1) / (4.0 * self.focal[k])
         return as_float(
@@ -153,12 +153,12 @@ class MirrorShape:
         )
 
     def along_facet(self, facet: npt.ArrayLike, xy: npt.ArrayLike) -> FloatArray:
-        """Return concentrator positions (K, 2) m along the axes of ``facet`` (K,), m, (K, 2)."""
+        """Convert concentrator positions ``xy`` (K, 2), m, to positions on ``facet`` (K,), m."""
         k, target = np.asarray(facet, dtype=np.intp), as_float(xy)
         inverse = np.linalg.inv(np.swapaxes(self.axes[k][:, :2, :2], -1, -2))
         uv = np.zeros((len(k), 2))
         for _ in range(8):
-            # The height changes x and y only along the normal of a canted facet.
+            # Because the height is along the normal, it changes x and y only on a canted facet.
             gap = target - self.on_facet(k, uv)[:, :2]
             uv = uv + (inverse @ gap[..., None])[..., 0]
             if np.abs(gap).max(initial=0.0) < 1e-12:
@@ -166,7 +166,7 @@ class MirrorShape:
         return uv
 
     def facet_at(self, xy: npt.ArrayLike) -> IntArray:
-        """Return the facet at each concentrator position (K, 2) m, or -1."""
+        """Return the facet at each concentrator position, m, (K, 2); -1 if there is none."""
         points = as_float(xy).reshape(-1, 2)
         facets = np.full(len(points), -1, dtype=np.intp)
         for k in range(len(self)):
@@ -175,7 +175,7 @@ class MirrorShape:
         return facets
 
     def point_at(self, facet: npt.ArrayLike, xy: npt.ArrayLike) -> FloatArray:
-        """Return the surface points (K, 3) at concentrator positions (K, 2) m."""
+        """Return the surface points (K, 3) at concentrator positions, m, (K, 2)."""
         return self.on_facet(facet, self.along_facet(facet, xy))
 
     def normal_at(
@@ -201,13 +201,13 @@ class MirrorShape:
         return normalize(np.einsum("ki,kij->kj", own, self.axes[k]))
 
     def slope_at(self, facet: IntArray, uv: FloatArray) -> FloatArray:
-        """Return the slope map at (K, 2) m along the axes of facets (K,), rad, (K, 2)."""
+        """Return the slope map, rad, (K, 2), at ``uv`` (K, 2), m, on the axes of facets (K,)."""
         cell, st = self._cell(facet, uv)
         return self.patch(facet, cell).at(st)[0]
 
     @cached_property
     def nodes(self) -> FloatArray:
-        """Slope deviations at the corners of cells, rad, (F, I, J, 2), constant at the edges."""
+        """Slope deviations at the cell corners, rad, (F, I, J, 2); constant towards the edges."""
         if self.slope is None:
             return np.zeros((len(self), _CELLS + 1, _CELLS + 1, 2))
         return np.pad(self.slope, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
@@ -232,7 +232,7 @@ class MirrorShape:
         return at, st
 
     def patch(self, facet: IntArray, cell: IntArray) -> "Patch":
-        """Return the slope map on cells (column, row) (K, 2) of facets (K,)."""
+        """Return the slope map on cells, given as (column, row), (K, 2), of facets (K,)."""
         j, i = cell[:, 0], cell[:, 1]
         lines = self.lines
         low = np.stack([lines[0][j], lines[1][i]], axis=-1) * self.half_size[facet]
@@ -250,7 +250,7 @@ class MirrorShape:
 
 @dataclass(frozen=True)
 class Patch:
-    """K cells: origin and size, m, (K, 2), and a bilinear function's values at their corners."""
+    """K cells: origin and size, m, (K, 2), and values of a bilinear function at the corners."""
 
     low: FloatArray
     size: FloatArray
@@ -277,7 +277,7 @@ class ReflectionPoints:
     Attributes
     ----------
     position
-        Row of the camera's position, (K,), ascending.
+        Index of the camera position, (K,), ascending.
     facet
         (K,).
     xy
@@ -301,9 +301,10 @@ def ideal(heliostats: Heliostats, row: int, focal: npt.ArrayLike = np.inf) -> Mi
     Parameters
     ----------
     heliostats, row
-        Heliostats; without facets the mirror is one facet of its width and height.
+        Heliostats, and an index. A mirror without facets is one facet with the width and height of
+        the mirror.
     focal
-        Focal length of the facets, m, () or (F,); inf for flat ones.
+        Focal length of the facets, m, () or (F,); inf for flat facets.
     """
     if heliostats.facets is None:
         return rectangle(heliostats.width[row], heliostats.height[row], focal)
@@ -335,7 +336,7 @@ def tiled(
     Parameters
     ----------
     columns, rows
-        Facets are counted from the lower left, row by row.
+        Numbers of columns and rows; facets are counted from the lower left, row by row.
     width, height
         Size of a facet, m.
     gap
@@ -382,9 +383,10 @@ def reflection_points(
 ) -> ReflectionPoints:
     """Return all points of a mirror that show the lamp to the camera, for P positions.
 
-    A facet may show it nowhere, once or several times. The points are exact to 1e-9 m. If a whole
-    patch lights up, at its centre of curvature, there is no single point, and the patch is left
-    out. Obstruction by other mirrors and facets is not considered.
+    A facet may show the lamp nowhere, once or several times. The points are exact to 1e-9 m. If the
+    lamp and the camera are at a patch's centre of curvature, the whole patch lights up and there is
+    no single point, so the patch is left out. Obstruction by other mirrors and facets is not
+    considered.
 
     Parameters
     ----------
@@ -424,7 +426,7 @@ def _blocks(shape: MirrorShape, positions: int) -> Iterator[tuple[int, int]]:
 def _within(
     shape: MirrorShape, camera: FloatArray, led: FloatArray, start: int, stop: int
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return position row, facet, and coordinates along the facet of reflections in a block."""
+    """Return the position index, facet, and facet coordinates of the reflections in a block."""
     position, facet, cell, values = _candidates(shape, camera[start:stop], led[start:stop])
     position += start
     starts = _bilinear_roots(values)
@@ -444,7 +446,7 @@ def _within(
 def _candidates(
     shape: MirrorShape, camera: FloatArray, led: FloatArray
 ) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-    """Return position, facet, cell (K, 2) and g at the corners (K, 4, 2) of likely cells."""
+    """Return position and facet indices, cells (K, 2), and g at the cell corners (K, 4, 2)."""
     nodes = shape.nodes
     facets, rows, columns = nodes.shape[:3]
     line_u, line_v = shape.lines
@@ -453,7 +455,7 @@ def _candidates(
     which = np.repeat(np.arange(facets), rows * columns)
     points = shape.on_facet(which, uv.reshape(-1, 2))
     slope = (uv / (2.0 * shape.focal[:, None, None, None]) + nodes).reshape(-1, 2)
-    # Components are kept apart: sums over a last axis of 3 are slow.
+    # Components are kept in separate arrays, because sums over a last axis of 3 are slow.
     total = [np.zeros((len(camera), len(points))) for _ in range(3)]
     for end in (camera, led):
         path = [end[:, k, None] - points[:, k] for k in range(3)]
@@ -462,7 +464,7 @@ def _candidates(
             total[k] += path[k] * scale
     axes = shape.axes[which]
     u, v, w = (sum(total[i] * axes[:, k, i] for i in range(3)) for k in range(3))
-    # Nothing is visible from behind the facet; the NaN compares false below.
+    # Nothing is visible from behind the facet; NaN compares as false below.
     ahead = np.where(w > 0.0, w, np.nan)
     maybe = np.ones((len(camera), facets, rows - 1, columns - 1), dtype=np.bool_)
     corners = []
@@ -480,10 +482,11 @@ def _candidates(
 
 
 def _bilinear_roots(corners: FloatArray) -> FloatArray:
-    """Return both (s, t) at which a + b s + c t + d s t is closest to 0, (K, 2, 2), about the cell.
+    """Return both (s, t), (K, 2, 2), at which a + b s + c t + d s t is closest to 0.
 
-    Eliminating s leaves (c × d) t² + (a × d + c × b) t + a × b = 0, with × the cross product in
-    the plane. Of complex roots the common real part is returned.
+    Eliminating s leaves (c × d) t² + (a × d + c × b) t + a × b = 0, with × the cross product in the
+    plane. The positions are relative to the cell. For complex roots, their common real part is
+    returned.
     """
     a = corners[:, 0]
     b, c = corners[:, 1] - a, corners[:, 2] - a
@@ -494,7 +497,7 @@ def _bilinear_roots(corners: FloatArray) -> FloatArray:
 
     quadratic, linear, constant = cross(c, d), cross(a, d) + cross(c, b), cross(a, b)
     root = np.sqrt(np.maximum(linear**2 - 4.0 * quadratic * constant, 0.0))
-    # The numerically stable pair: q / quadratic and constant / q.
+    # This is the numerically stable pair of roots, q / quadratic and constant / q.
     q = -0.5 * (linear + np.where(linear < 0.0, -root, root))
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.stack([constant / q, q / quadratic], axis=-1)
@@ -514,7 +517,7 @@ def _newton(
     ends: tuple[FloatArray, FloatArray],
     st: FloatArray,
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Return fractional cell positions (K, 2) at which g is 0, and which of them converged."""
+    """Return fractional cell positions (K, 2) at which g is 0, and a mask of convergence."""
     good = np.zeros(len(st), dtype=np.bool_)
     for _ in range(_ITERATIONS):
         g, slope = _law(shape, facet, patch, ends, st)

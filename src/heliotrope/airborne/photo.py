@@ -1,7 +1,7 @@
 """Aerial photographs: camera, position and attitude.
 
-The camera model and its conventions are those of `heliotrope.field.camera`: camera axes x
-right, y down, z forward, and rotations from camera axes to ENU.
+The camera model and its conventions are those of `heliotrope.field.camera`: camera axes with x to
+the right, y down and z forward, and rotations from camera axes to ENU.
 """
 
 import math
@@ -32,9 +32,9 @@ from heliotrope.geometry import (
 
 #: Suffixes of photographs.
 SUFFIXES = (".jpg", ".jpeg")
-#: Standard deviation of a fixed RTK solution that states none, m.
+#: Standard deviation of a fixed RTK solution for which none is stated, m.
 RTK_SIGMA = 0.01
-#: Points farther out than this multiple of the frame's corners are not seen.
+#: Points farther out than this multiple of the frame corners are not visible.
 REACH = 1.3
 
 
@@ -85,11 +85,11 @@ class Photo:
     name
         Name of the file.
     time
-        UTC; None if no time with a time zone is stated.
+        Time of exposure, UTC; None if no time with a time zone is stated.
     position
         Position of the projection centre, ENU metres, (3,).
     rotation
-        Camera axes to ENU, (3, 3).
+        Rotation from camera axes to ENU, (3, 3).
     sigma_position
         Standard deviation of the position east, north, up, m, (3,).
     path
@@ -124,7 +124,7 @@ class Photo:
     def pixels(self, camera: LedCamera, points: npt.ArrayLike) -> FloatArray:
         """Return the pixels (..., 2) at which points, ENU metres (..., 3), appear.
 
-        NaN behind the camera or beyond `REACH`.
+        The result is NaN for points behind the camera or beyond `REACH`.
         """
         local = (as_vectors(points, "points") - self.position) @ self.rotation
         return local_pixels(camera, local, REACH)
@@ -137,20 +137,20 @@ class Photo:
 def rotation_of_gimbal(yaw: float, pitch: float, roll: float) -> FloatArray:
     """Return the rotation from camera axes to ENU, (3, 3), for gimbal angles in rad.
 
-    Angles as defined by DJI: rotations about the axes of a body x forward, y right, z down, in the
-    order yaw, pitch, roll, from north-east-down. Yaw is clockwise from north, pitch is 0 at the
-    horizon and −π/2 straight down, roll lowers the right side.
+    The angles are defined as by DJI: rotations about the axes of a body with x forward, y to the
+    right and z down, in the order yaw, pitch, roll, starting from north-east-down. Yaw is clockwise
+    from north, pitch is 0 at the horizon and −π/2 straight down, roll lowers the right side.
     """
     ned = rotation([0.0, 0.0, 1.0], yaw) @ rotation([0.0, 1.0, 0.0], pitch)
     ned = ned @ rotation([1.0, 0.0, 0.0], roll)
-    # Camera x right, y down, z forward are the body's y, z, x; ENU are NED's y, x, −z.
+    # Camera x (right), y (down), z (forward) are the body's y, z, x; ENU are the y, x, −z of NED.
     return as_float(ned[[1, 0, 2]][:, [1, 2, 0]] * np.array([[1.0], [1.0], [-1.0]]))
 
 
 def gimbal_of_rotation(turned: npt.ArrayLike) -> tuple[float, float, float]:
     """Return yaw in [−π, π], pitch and roll, rad: the inverse of `rotation_of_gimbal`.
 
-    Straight down, yaw and roll are one angle, which is returned as yaw.
+    If the camera looks straight down, yaw and roll are the same rotation, which is returned as yaw.
     """
     enu = as_float(turned)
     ned = (enu * np.array([[1.0], [1.0], [-1.0]]))[[1, 0, 2]][:, [2, 0, 1]]
@@ -220,7 +220,7 @@ def write_camera(path: str | Path, camera: LedCamera) -> None:
 def read_photos(
     folder: str | Path, plant_origin: tuple[float, float, float]
 ) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """Return the photographs in a folder in the order of their names, and the problems.
+    """Return the photographs in a folder, sorted by name, and a message for each problem.
 
     Position, gimbal angles and time come from ``photos.csv`` in the folder if it exists, otherwise
     from the EXIF and XMP metadata that DJI drones write.
@@ -228,7 +228,7 @@ def read_photos(
     Parameters
     ----------
     folder
-        Folder of JPEG files, see `SUFFIXES`.
+        Folder of JPEG files; see `SUFFIXES`.
     plant_origin
         Latitude and longitude (degrees) and height (m) of the ENU origin. This height and those of
         the photographs must be of the same kind (both above the ellipsoid, or both above the
@@ -236,16 +236,16 @@ def read_photos(
 
     Returns
     -------
-    Photographs, and a message for each that cannot be used because position or angles are missing,
-    no RTK solution is marked as fixed, or its size differs from that of most photographs (mixed
-    cameras).
+    Photographs, and a message for each photograph that cannot be used because its position or
+    angles are missing, its RTK solution is not marked as fixed, or its size differs from that of
+    most photographs (mixed cameras).
 
     Raises
     ------
     InputError
         If the folder does not exist, or contains no usable photograph.
     FormatError
-        If ``photos.csv`` is not such a table.
+        If ``photos.csv`` is not a table of photographs.
     """
     place = Path(folder)
     if not place.is_dir():

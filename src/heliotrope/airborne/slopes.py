@@ -1,4 +1,4 @@
-"""Random slope maps of mirrors, for simulation; of files: `heliotrope.field.formats.slopes`."""
+"""Random slope maps for simulation; `heliotrope.field.formats.slopes` reads maps from files."""
 
 import numpy as np
 
@@ -26,11 +26,11 @@ def smooth_slopes(
     shape
         Shape of the mirror.
     generator
-        Source of the randomness.
+        Source of random numbers.
     rms
         RMS of ∂z/∂u and of ∂z/∂v over the mirror, rad.
     length
-        Correlation length of the slopes, m: that of a Gaussian filter of the heights.
+        Correlation length of the slopes, m, which is that of the Gaussian filter of the heights.
     cells
         Number of cells along each edge of a facet.
 
@@ -49,7 +49,7 @@ def smooth_slopes(
     slope = np.zeros((len(shape), cells, cells, 2))
     for k, (half_width, half_height) in enumerate(shape.half_size):
         step = np.array([2.0 * half_height, 2.0 * half_width]) / cells
-        # A border as wide as the filter makes the edges as rough as the interior.
+        # A border as wide as the filter ensures that the edges are as rough as the interior.
         border = [int(np.ceil(3.0 * length / s)) for s in step]
         size = [cells + 2 * b for b in border]
         high = gaussian_filter(generator.standard_normal(size), length / step, mode="wrap")

@@ -1,7 +1,7 @@
 """Mirror poses: vertex, rotation and outline of each mirror at its drive positions.
 
-Concentrator coordinates: origin at the vertex, x to the right as seen from the front, y up along
-the mirror, z the normal.
+Concentrator coordinates have their origin at the vertex, x to the right as seen from the front, y
+up along the mirror, and z along the normal.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ class MirrorPoses:
     vertex
         ENU metres, (N, 3).
     rotation
-        Concentrator to ENU, (N, 3, 3).
+        Rotation from concentrator coordinates to ENU, (N, 3, 3).
     outline
         Corners in concentrator coordinates, m: upper left, upper right, lower right, lower left
         as seen from the front, (N, 4, 3).
@@ -70,12 +70,12 @@ def standing(heliostats: Heliostats, counts: npt.ArrayLike) -> MirrorPoses:
 
 
 def join_standing(parts: Sequence[MirrorPoses]) -> MirrorPoses:
-    """Return several groups of mirrors as one, in the order given.
+    """Join several groups of mirrors, in order.
 
     Raises
     ------
     InputError
-        If there are none.
+        If there are no groups.
     """
     if not parts:
         raise InputError("no heliostat is commanded; list the heliostats that the photographs show")
@@ -90,7 +90,8 @@ def join_standing(parts: Sequence[MirrorPoses]) -> MirrorPoses:
 def outline(heliostats: Heliostats) -> FloatArray:
     """Return the corners of mirrors in concentrator coordinates, (N, 4, 3).
 
-    The outermost corners of the facets, with their heights, or of a flat rectangle.
+    The corners are the outermost corners of the facets, with their heights, or those of a flat
+    rectangle.
     """
     signs = np.array([(-1.0, 1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
     facets = heliostats.facets
@@ -123,7 +124,7 @@ def read_commands(
     names
         Names of the plant's heliostats.
     cluster, point
-        Select the rows of this cluster and this calibration point; "" for all.
+        Cluster and calibration point whose rows are selected; "" for all.
 
     Raises
     ------
@@ -161,7 +162,7 @@ def read_commands(
 
 
 def write_commands(path: str | Path, names: Sequence[str], counts: npt.ArrayLike) -> None:
-    """Write the drive counts (N, D) of heliostats in the form that `read_commands` reads."""
+    """Write the drive counts (N, D) of heliostats to a file that `read_commands` can read."""
     table = as_float(counts)
     header = ["heliostat", *(f"count_{k + 1}" for k in range(table.shape[1]))]
     lines = [",".join(header)]

@@ -1,4 +1,4 @@
-"""Which parts of which mirrors an airborne camera sees, given that nearer mirrors hide others.
+"""Which parts of the mirrors an airborne camera sees when nearer mirrors hide others.
 
 Seen from a low drone, the mirrors of a dense field overlap. Planning and detection use this same
 model, so a flight is planned only where its photographs can be evaluated.
@@ -19,30 +19,30 @@ Mask = npt.NDArray[np.bool_]
 SMALLEST = 12.0
 #: With fewer reflections of a mirror, the standard deviation is meaningless.
 FEWEST = 5
-#: Spots closer to an edge than this are not searched for, px: half the spot width, plus the error
-#: of the edge.
+#: Spots closer to an edge than this are not searched for, px. The margin is half the spot width
+#: plus the error of the edge.
 MARGIN = 2
-#: If more than this share of the mirrors is hidden by more than `_TOUCHED`, their images merge.
+#: If more than this fraction of the mirrors is hidden by more than `_TOUCHED`, their images merge.
 _MERGED, _TOUCHED = 0.1, 0.02
-#: Fractional bits of polygons' corners.
+#: Number of fractional bits of polygon corners.
 _BITS = 4
 
 
 def draw_labels(
     outlines: FloatArray, distance: FloatArray, size: tuple[int, int], scale: float = 1.0
 ) -> Labels:
-    """Return the mirror that each pixel shows, (height, width): its row plus 1, or 0 for none.
+    """Return the index, plus 1, of the mirror that each pixel shows, (height, width); 0 for none.
 
     Parameters
     ----------
     outlines
-        Corners of M mirrors, px, (M, 4, 2); mirrors with NaN are left out.
+        Corners of M mirrors, px, (M, 4, 2); mirrors with NaN corners are left out.
     distance
-        From the camera, m, (M,).
+        Distances of the mirrors from the camera, m, (M,).
     size
         Width and height of the picture, px.
     scale
-        Pixels of the result for one of the picture.
+        Number of pixels in the result per pixel of the picture.
     """
     import cv2
 
@@ -67,12 +67,12 @@ class Visibility:
     Attributes
     ----------
     share
-        Fraction of each mirror's area where a reflection can be found, (N,): not hidden by a nearer
-        mirror, and not closer to an edge than `MARGIN`.
+        Fraction of each mirror's area where a reflection can be found, (N,). This area is not
+        hidden by a nearer mirror and not closer to an edge than `MARGIN`.
     hidden
         Fraction of each mirror's area hidden by nearer mirrors, (N,).
     side
-        Root of each mirror's area in the picture, px, (N,).
+        Square root of each mirror's area in the picture, px, (N,).
     """
 
     share: FloatArray
@@ -88,7 +88,8 @@ class Visibility:
 def seen_from(stand: MirrorPoses, place: npt.ArrayLike, focal: float) -> Visibility:
     """Return how well a camera of focal length ``focal`` (px) at ``place`` (3,) sees mirrors.
 
-    The camera is aimed at their centre; mirrors seen from behind hide others but show nothing.
+    The camera is aimed at the centre of the mirrors. Mirrors seen from behind hide other mirrors
+    but show nothing.
     """
     import cv2
 

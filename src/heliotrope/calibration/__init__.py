@@ -1,8 +1,8 @@
-"""From sightings to the parameters of each heliostat, with their covariance.
+"""Estimate the parameters of each heliostat, and their covariance, from sightings.
 
 A sighting is one measurement of where a mirror points; `camera_target`, `drone`, `sun_sensor` and
-`field_camera` create `Sightings` of every kind, and `read_sightings` reads a table. The
-subpackages:
+`field_camera` create `Sightings`, each from one kind of measurement, and `read_sightings` reads
+them from a table. The subpackages:
 
 - `calibration.fit`: the parameters of each heliostat (`fit`);
 - `calibration.learn`: a whole field, with drift, steps and outliers (`learn`, `predict`);

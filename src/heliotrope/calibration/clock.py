@@ -1,11 +1,11 @@
-"""Clock error, tested as a hypothesis common to all heliostats of a field.
+"""Test whether one clock error explains the sightings of all heliostats of a field.
 
 The sun's direction is computed from the time. A clock that is fast by a minute shifts every sun
 position by 4 mrad. The parameters of each heliostat absorb most of that shift, and the remainder
 reveals the error. The check shifts all sun positions along the sun's path by one trial time offset
-and refits all heliostats; the best offset is refined by Gauss-Newton. The uncertainty is that of
-the noise, or that of the scatter between heliostats if it is larger. The check only reports an
-error and never corrects it, because times and sun vectors must be corrected at the plant.
+and refits all heliostats; the best offset is refined by Gauss-Newton. The uncertainty follows from
+the noise, or from the scatter between heliostats if that is larger. The check only reports an error
+and never corrects it, because times and sun vectors must be corrected at the plant.
 """
 
 from dataclasses import dataclass, replace
@@ -25,20 +25,20 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.sun import Site
 from heliotrope.values import amount
 
-#: Rotation rate of the sky, rad/s (of the sun, in a mean solar day).
+#: Mean rotation rate of the sun about the pole, rad/s (one turn per mean solar day).
 RATE = 2.0 * np.pi / 86400.0
 #: Range and step of the trial offsets, s: all time zones of the Earth.
 REACH, STEP = 14 * 3600.0, 3600.0
-#: A clock error is reported from this many standard deviations on.
+#: A clock error is reported if it reaches this many standard deviations.
 CLEAR = 3.0
-#: Number of heliostats (those with the most sightings) and of sightings of each in the test; fewer
-#: in the first search.
+#: Number of heliostats in the test (those with the most sightings), and of sightings per heliostat;
+#: the first search uses fewer.
 MIRRORS, MOST, FIRST = 10, 60, 20
-#: Minimum number of sightings of a heliostat that say something about the clock.
+#: A heliostat with fewer sightings than this says nothing about the clock.
 FEWEST = 8
-#: Maximum number of steps from a start.
+#: Maximum number of Gauss-Newton steps from each starting offset.
 ROUNDS = 8
-#: Weight of the stated sigma in the estimate of the noise, degrees of freedom.
+#: Weight of the stated sigma in the estimate of the noise, as a number of degrees of freedom.
 FREEDOM = 5.0
 
 
@@ -64,7 +64,7 @@ class ClockCheck:
         return abs(self.error) > CLEAR * self.sigma
 
     def __str__(self) -> str:
-        """One line."""
+        """Return the result in one line."""
         if not self.found:
             least = abs(self.error) + CLEAR * self.sigma
             return (
@@ -82,7 +82,7 @@ class ClockCheck:
         )
 
     def document(self) -> dict[str, float | bool]:
-        """Return the results for JSON."""
+        """Return the results as a JSON object."""
         return {
             "error_s": self.error,
             "sigma_s": self.sigma,
@@ -135,7 +135,7 @@ def check_clock(
 
 @dataclass(frozen=True)
 class _Step:
-    """The further shift of the sun positions that shifted sightings require, and its sigma, s."""
+    """The total shift that the sun positions need, and its standard deviation, s."""
 
     shift: float
     sigma: float
@@ -144,7 +144,7 @@ class _Step:
 def _settled(
     mechanism: Mechanism, sightings: Sightings, model: tuple[str, ...], site: Site, shift: float
 ) -> _Step:
-    """Return the shift at which the sightings require no further shift, from a start."""
+    """Return the shift at which the sightings need no further shift, searching from ``shift``."""
     for _ in range(ROUNDS):
         step = _step(mechanism, sightings, model, site, shift)
         done = abs(step.shift - shift) < 0.1 * step.sigma
@@ -157,11 +157,11 @@ def _settled(
 def _step(
     mechanism: Mechanism, sightings: Sightings, model: tuple[str, ...], site: Site, shift: float
 ) -> _Step:
-    """Return one Gauss-Newton step.
+    """Return the shift after one Gauss-Newton step from ``shift``.
 
-    With H, B and Z the normal matrices of a heliostat's own parameters, of their coupling with the
-    shift and of the shift, the heliostat provides the information Z - B^T H^-1 B on the shift (as
-    in `fit.common`).
+    Let H be the normal matrix of a heliostat's own parameters, B their coupling with the shift and
+    Z the normal matrix of the shift. The heliostat then provides the information Z - B^T H^-1 B on
+    the shift (as in `fit.common`).
     """
     moved = later(sightings, site, shift)
     fitted = fit(mechanism, moved, model, adapt_scale=False)
@@ -196,14 +196,15 @@ def _step(
     known = float(information.sum())
     change, variance = -float(pulled.sum()) / known, 1.0 / known
     if count > 2:
-        # If heliostats disagree by more than their noise, their scatter is the uncertainty.
+        # If heliostats disagree by more than their noise, the uncertainty is taken from their
+        # scatter.
         away = -pulled / information - change
         variance *= max(1.0, float((information * away**2).sum()) / (count - 1))
     return _Step(shift + change, float(np.sqrt(variance)))
 
 
 def _noise(fitted: FieldFit) -> FloatArray:
-    """Return the variance of each heliostat's sightings in units of their sigma, (N,)."""
+    """Return how many times sigma² the variance of each heliostat's sightings is, (N,)."""
     square = (fitted.lengths * fitted.scale[fitted.rows]) ** 2
     robust = CAUCHY_WIDTH**2 * np.log1p(square / CAUCHY_WIDTH**2)
     count = len(fitted.scale)
@@ -213,7 +214,7 @@ def _noise(fitted: FieldFit) -> FloatArray:
 
 
 def later(sightings: Sightings, site: Site, shift: float) -> Sightings:
-    """Return sightings of the sun with the sun positions of ``shift`` s later.
+    """Return sightings of the sun with every sun position moved on by ``shift`` s.
 
     If the time is known and matches the stated sun vector, the sun position is computed for the
     shifted time; otherwise the stated vector is rotated about the pole.
@@ -233,7 +234,7 @@ def later(sightings: Sightings, site: Site, shift: float) -> Sightings:
 
 
 def _part(suns: Sightings, chosen: npt.NDArray[np.intp], most: int) -> Sightings:
-    """Return at most a given number of sightings per heliostat, spread evenly over all of them."""
+    """Return at most ``most`` sightings of each chosen heliostat, spread evenly over all."""
     rows, place = [], []
     for k, row in enumerate(chosen):
         mine = np.flatnonzero(suns.heliostat == row)

@@ -33,7 +33,7 @@ def measure(
     Parameters
     ----------
     nominal, truth
-        Mechanisms as commanded and as built, (N,).
+        Mechanisms as assumed by the control system and as built, (N,).
     target, site
         Target of the beams; site and atmosphere.
     days
@@ -87,14 +87,14 @@ class TrackedDay:
 
     @property
     def rms(self) -> tuple[float, float]:
-        """RMS before and after, rad."""
+        """Return the RMS error before and after calibration, rad."""
         return float(np.sqrt(np.mean(self.before**2))), float(np.sqrt(np.mean(self.after**2)))
 
 
 def track_day(
     group: Heliostats, truth: Mechanism, aim: FloatArray, site: Site, day: date
 ) -> TrackedDay:
-    """Return the beam errors over a day, every 5 minutes.
+    """Return the beam errors every 5 minutes over a day.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def track_day(
     truth
         Mechanisms as built, (N,).
     aim, site, day
-        Aim point, (3,); site; UTC day.
+        Aim point, (3,); site; day in UTC.
     """
     times = solar.daylight(day, site, every=timedelta(minutes=5), min_elevation=0.1)
     suns = solar.vector(times, site)

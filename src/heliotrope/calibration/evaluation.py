@@ -1,4 +1,4 @@
-"""Beam and normal errors under given parameters, and splits of sightings for testing."""
+"""Beam errors and normal errors for given parameters, and splits of sightings for testing."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -25,7 +25,7 @@ Split = Literal[
     "balanced",
     "high-variance",
 ]
-#: Fraction of the sightings in a held-out neighbourhood; at least three sightings.
+#: Fraction of a heliostat's sightings in one held-out neighbourhood, which has at least three.
 NEIGHBOURHOOD = 0.1
 
 
@@ -38,7 +38,7 @@ class BeamErrors(Value, Framed):
     beam
         Angle between the reflected ray and the direction to the destination, rad, (M,).
     normal
-        Angle between the normal and the bisector, rad, (M,).
+        Angle between the mirror normal and the bisector, rad, (M,).
     offset
         Beam error to the right of and above the destination as seen from the mirror,
         rad, (M, 2).
@@ -115,7 +115,7 @@ def beam_errors(mechanism: Field, sightings: Sightings) -> BeamErrors:
 def split(
     sightings: Sightings, kind: Split = "random", fraction: float = 0.7, seed: int = 0
 ) -> npt.NDArray[np.bool_]:
-    """Return the mask (M,) of the training part, ``fraction`` of each heliostat's sightings.
+    """Return the mask (M,) of the training sightings, ``fraction`` of each heliostat's sightings.
 
     Parameters
     ----------
@@ -158,9 +158,9 @@ def split(
 def partition(
     sightings: Sightings, kind: Split = "random", fraction: float = 0.7, seed: int = 0
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Return the masks (M,) of the training part and of the test part, as in `split`.
+    """Return two masks (M,), of the training and of the test sightings, chosen as in `split`.
 
-    PAINT's splits have a part for validation, which belongs to neither.
+    PAINT's splits also set aside validation sightings, which are in neither mask.
     """
     if kind in KINDS:
         return paint_split(sightings, kind, seed)
@@ -169,12 +169,12 @@ def partition(
 
 
 def check_fraction(fraction: float) -> None:
-    """Raise an error for a training fraction that leaves nothing to learn from or to test on.
+    """Raise an error if a training fraction leaves nothing to learn from or to test on.
 
     Raises
     ------
     InputError
-        If it does not lie between 0 and 1.
+        If the fraction is not between 0 and 1.
     """
     if not 0.0 < as_numbers(fraction, "fraction") < 1.0:
         raise InputError(f"fraction must be between 0 and 1, not {fraction}")
@@ -183,7 +183,7 @@ def check_fraction(fraction: float) -> None:
 def _by_neighbourhood(
     sightings: Sightings, rows: npt.NDArray[np.intp], fraction: float, seed: int
 ) -> npt.NDArray[np.intp]:
-    """Order the sightings of one heliostat so that whole neighbourhoods of the sky come last."""
+    """Order one heliostat's sightings so that whole neighbourhoods of sun positions come last."""
     rng = np.random.default_rng((seed, int(sightings.heliostat[rows[0]])))
     sky = sightings.source[rows]
     many = max(3, round(NEIGHBOURHOOD * len(rows)))
@@ -208,7 +208,7 @@ class ErrorSummary:
 
 
 def summarise(beam: FloatArray) -> ErrorSummary:
-    """Return median, RMS and 95th percentile of beam errors (M,), NaN if there are no errors."""
+    """Return the median, RMS and 95th percentile of beam errors (M,); NaN if M is 0."""
     if not len(beam):
         return ErrorSummary(0, np.nan, np.nan, np.nan)
     return ErrorSummary(

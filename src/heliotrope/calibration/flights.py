@@ -2,9 +2,9 @@
 
 `drone evaluate` writes the file ``flight.json``, and a plant reads it. Each record is the
 orientation of one mirror in one pose; see ``docs/reference/formats.md``. A record contains what
-belongs to one measurement, and the file header what all records share: an error in the RTK base
-position displaces the drone equally in all records, and an error in the focal length displaces each
-mirror away from the middle of the flight.
+belongs to one measurement, and the file header describes the errors that all records share. For
+example, an error in the RTK base position displaces the drone equally in all records, and an error
+in the focal length displaces each mirror away from the middle of the flight.
 """
 
 import json
@@ -22,7 +22,7 @@ from heliotrope.errors import FormatError, InputError
 from heliotrope.files.text import read_text, write_text
 from heliotrope.geometry import FloatArray
 
-#: Most rows of a flight, and most errors that they share.
+#: Maximum number of records in a flight, and of errors that they share.
 MOST_ROWS, MOST_SHARED = 20_000, 24
 #: Largest file, bytes.
 LARGEST = 8 << 20
@@ -53,16 +53,15 @@ class FlightRow(_Strict):
     counts
         Counts of its drives.
     place_m
-        Point on the mirror's normal at the distance of the drone, ENU: as if lamp and camera were
-        one.
+        Point on the mirror's normal at the distance of the drone, ENU, as if the lamp and the
+        camera were in one place.
     sigma_rad
         Standard deviation of the normal about each axis, excluding the errors below.
     turn_rad
         Standard deviation of the rotation common to all poses of this mirror, due to unknown slopes
         and the survey of its position.
     covariance_m2
-        Covariance of the mirror's position relative to the drone that is specific to this record,
-        ENU.
+        Covariance of the mirror's position relative to the drone, ENU, excluding the shared errors.
     shift
         Displacement of the drone relative to the mirror per unit of each shared error, recorded
         minus true, ENU, m: three lists, east, north and up.
@@ -171,7 +170,7 @@ class Flight:
 
     @classmethod
     def of(cls, document: FlightDocument) -> "Flight":
-        """Convert a document to a flight."""
+        """Convert a document into a flight."""
         rows = document.rows
         names = tuple(dict.fromkeys(row.heliostat for row in rows))
         index = {name: i for i, name in enumerate(names)}
@@ -185,7 +184,8 @@ class Flight:
             places,
             places,
             time=np.array([row.time for row in rows]),
-            # The ray rotates by twice the error of the normal, and lamp and camera move together.
+            # The ray rotates by twice the error of the normal, and the lamp and camera move
+            # together.
             sigma=2.0 * np.array([row.sigma_rad for row in rows]),
             camera_covariance=4.0 * np.array([row.covariance_m2 for row in rows]),
         )
@@ -252,6 +252,6 @@ def _text(value: Any) -> str:
 
 
 def flight_name(parts: Sequence[str], at: float) -> str:
-    """Return a name for a flight, composed of its parts and its time (POSIX s)."""
+    """Return a name for a flight, composed of the parts and the time ``at`` (POSIX s)."""
     day = np.datetime_as_string(np.datetime64(round(at), "s"))
     return f"{day}Z {' '.join(part for part in parts if part)}".strip()[:64]

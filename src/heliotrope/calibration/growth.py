@@ -1,8 +1,8 @@
-r"""Growth of a calibration's covariance with time, through drift after the last photograph.
+r"""Growth of a calibration's covariance with time, due to drift after the last photograph.
 
-The parameters drift as `heliotrope.calibration.learn.drift` describes. A heliostat that keeps the
-values of its calibration is off, after a time Δ, by the amount that its drift processes have moved
-since:
+The parameters drift as `heliotrope.calibration.learn.drift` describes. If a heliostat keeps its
+calibrated values, its error after a time Δ is the distance that its drift processes have moved in
+the meantime:
 
 $$ \langle (d(t + Δ) - d(t))^2 \rangle = 2 a^2 (1 - e^{-Δ/τ}) + r Δ s^2 , $$
 
@@ -24,18 +24,19 @@ from heliotrope.mechanism.chain import Mechanism
 
 @dataclass(frozen=True)
 class Growth:
-    """Growth of the variances of parameters with time; without arguments nothing grows.
+    """Growth of the variances of parameters with time; by default nothing grows.
 
-    Objects with equal values are equal, so the heliostats of a group are computed together.
+    Objects with equal values compare as equal, so that the heliostats of a group can be computed
+    together.
 
     Attributes
     ----------
     source
         Source of the values, for display.
     processes, variance, tau
-        Parameter, variance and time constant (days) of each process, C.
+        Parameter, variance and time constant (days) of each of the C processes.
     stepping, rate
-        Parameters that step, Z, and the growth of their variances in a day, (Z,).
+        The Z parameters that step, and the growth of their variances per day, (Z,).
     """
 
     source: str = "nothing grows"
@@ -47,10 +48,10 @@ class Growth:
 
     @classmethod
     def of(cls, hyper: Hyperparameters, source: str) -> "Growth":
-        """Return the growth under hyperparameters.
+        """Return the growth that follows from hyperparameters.
 
-        Processes within hours are left out, because they decay before the next visit and are part
-        of the noise of each sighting.
+        Processes on the scale of hours are left out, because they decay before the next calibration
+        visit and are already part of the noise of each sighting.
         """
         slow = [c for c, process in enumerate(hyper.processes) if process.group != "hours"]
         steps = np.flatnonzero(hyper.step > 0.0)
@@ -64,12 +65,12 @@ class Growth:
         )
 
     def variances(self, names: Sequence[str], days: npt.ArrayLike) -> FloatArray:
-        """Return the growth of the variances of parameters over days, (..., P).
+        """Return how much the variances of parameters grow over a number of days, (..., P).
 
         Parameters
         ----------
         names
-            P parameters; those that do not drift keep their variance.
+            Names of P parameters; the variance of a parameter that does not drift does not grow.
         days
             Days since the calibration, (...); negative values add nothing.
         """
@@ -83,13 +84,13 @@ class Growth:
     def grown(
         self, covariance: npt.ArrayLike, names: Sequence[str], days: npt.ArrayLike
     ) -> FloatArray:
-        """Return covariances (..., P, P) after days (...)."""
+        """Return what covariances (..., P, P) have grown to after ``days`` (...)."""
         added = self.variances(names, days)
         return as_float(as_float(covariance) + added[..., None] * np.eye(len(names)))
 
 
 def default_growth(mechanism: Mechanism) -> Growth:
-    """Return the growth for a kind of mechanism before its field has any sightings."""
+    """Return the growth to assume for a kind of mechanism before its field has any sightings."""
     hyper = drift.start(mechanism, drift.zeros(mechanism))
     tau, rate = drift.START_DAYS["slow"], drift.step_rate(())
     wander = f"zeros wander by {1e3 * drift.START_RAD['slow']:g} mrad over {tau:.0f} days"
@@ -98,7 +99,7 @@ def default_growth(mechanism: Mechanism) -> Growth:
 
 
 def _places(parameters: tuple[str, ...], names: Sequence[str]) -> FloatArray:
-    """Return the matrix that maps values of processes to parameters of the same name, (C, P)."""
+    """Return the matrix (C, P) that assigns each process to the parameter of the same name."""
     columns = np.array(names, dtype=np.str_)
     rows = np.array(parameters, dtype=np.str_)
     return as_float(rows[:, None] == columns)

@@ -1,4 +1,7 @@
-"""Compiled: the median of a few numbers; numpy's own takes ten times as long to compile."""
+"""Compiled kernel: the median of a few numbers.
+
+NumPy's own median takes ten times as long to compile.
+"""
 
 import math
 
@@ -9,7 +12,7 @@ from heliotrope.jit import INNER
 
 @njit(**INNER)
 def _select(values, k):
-    """Partition so that the k-th smallest element is at index k (Hoare)."""
+    """Partition values so that the k-th smallest is at index k (Hoare's algorithm)."""
     low, high = 0, values.shape[0] - 1
     while low < high:
         pivot = values[(low + high) // 2]
@@ -32,7 +35,7 @@ def _select(values, k):
 
 @njit(**INNER)
 def median(values):
-    """Median of values (n,), NaN if one is or if there is none; changes their order."""
+    """Return the median of values (n,), and change their order; NaN if any is NaN or n is 0."""
     n = values.shape[0]
     for i in range(n):
         if math.isnan(values[i]):

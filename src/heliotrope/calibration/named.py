@@ -1,4 +1,4 @@
-"""Heliostats as calibration functions accept them, and matching of sightings by name.
+"""Heliostats in the forms that calibration functions accept, and matching sightings by name.
 
 The functions accept mechanisms, one heliostat of a plant, a group, or a whole plant of one kind. If
 both heliostats and sightings have names, they are matched by name; otherwise by index.
@@ -18,7 +18,7 @@ from heliotrope.field.target import Target
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.sun import Site
 
-#: One mechanism or more, with or without names.
+#: One or more mechanisms, with or without names.
 Field: TypeAlias = Mechanism | Heliostat | Heliostats | Plant
 
 
@@ -54,7 +54,7 @@ class Members:
     single
         Whether a single heliostat was passed without a batch axis.
     around
-        Their surroundings.
+        Surroundings of the heliostats.
     """
 
     mechanism: Mechanism
@@ -63,7 +63,7 @@ class Members:
     around: Surroundings = NOWHERE
 
     def rows_of(self, sightings: Sightings) -> Sightings:
-        """Return the sightings with the rows of these heliostats.
+        """Return the sightings with heliostat indices that refer to these heliostats.
 
         Raises
         ------

@@ -1,7 +1,8 @@
-"""Corrects sightings on targets for shading and blocking by neighbouring heliostats.
+"""Correct sightings on targets for shading and blocking by neighbouring heliostats.
 
-The position of each heliostat is known, but the pose of its neighbours at the time is assumed: each
-is taken to track its own aim. As in the schedule, mirrors rotate about the foot of the heliostat.
+The position of each heliostat is known, but the pose of its neighbours at the time is not. Each
+neighbour is assumed to track its own aim. As in the schedule, mirrors rotate about the foot of the
+heliostat.
 """
 
 from dataclasses import dataclass, replace
@@ -18,10 +19,10 @@ from heliotrope.optics.mirror_surface import equal_facets
 from heliotrope.optics.scene import Mirrors
 from heliotrope.optics.shading import nearest
 
-#: A mirror with unknown facets is assumed to have its distance to the target as focal length, to
-#: within this share.
+#: The focal length of a mirror with unknown facets is assumed to equal its distance from the
+#: target, to within this fraction.
 _FOCAL = 0.25
-#: Share of a shift that remains uncertain, because the neighbours may not point where assumed.
+#: Fraction of a shift that remains uncertain, because the neighbours may not point where assumed.
 UNKNOWN = 0.25
 #: A destination is on a target if it is this close to the target's plane, m.
 _ON_PLANE = 0.1
@@ -34,12 +35,13 @@ class Unobstructed:
     Attributes
     ----------
     sightings
-        The sightings with corrected destinations and the uncertainty of the correction.
+        The sightings with corrected destinations; their covariances include the uncertainty of the
+        correction.
     shift
-        The shift that was removed, right and up on the target, m, (M, 2); 0 if nothing hides the
-        mirror.
+        The shift that was removed, right and up on the target, m, (M, 2); 0 if nothing shades or
+        blocks the mirror.
     hidden
-        Share of the mirror that neighbours hid, (M,).
+        Fraction of the mirror that neighbours shaded or blocked, (M,).
     """
 
     sightings: Sightings
@@ -47,7 +49,7 @@ class Unobstructed:
     hidden: FloatArray
 
     def __str__(self) -> str:
-        """One line."""
+        """Return the result in one line."""
         figures = self.summary()
         if not figures["corrected"]:
             return "shading and blocking: no neighbour in the plant file hides any of the mirrors"
@@ -58,7 +60,7 @@ class Unobstructed:
         )
 
     def summary(self) -> dict[str, float]:
-        """Return the numbers of sightings and of corrected sightings, and their shifts."""
+        """Return the numbers of all and of corrected sightings, and the sizes of the shifts."""
         moved = self.hidden > 0.0
         size = 1e3 * np.linalg.norm(self.shift, axis=1)[moved]
         return {
@@ -77,19 +79,20 @@ def unobstructed(
     Parameters
     ----------
     heliostats
-        All heliostats that may hide one another; the sightings refer to them by index.
+        All heliostats that may shade or block one another; the sightings refer to them by index.
     targets
-        Sightings of the sun's beam on one of them are corrected; others stay as they are.
+        Targets. Sightings of the sun's beam on one of them are corrected; other sightings are
+        unchanged.
     sightings
         The sightings.
     aim
-        Aim point of neighbours without their own aims, ENU metres, (3,).
+        Aim point of neighbours that have no aim of their own, ENU metres, (3,).
 
     Notes
     -----
-    The canting of mirrors whose facets are not known is assumed to be for the target. The
-    uncertainty of their shift includes its change with focal lengths a quarter longer and shorter;
-    every shift is also uncertain by a quarter of itself.
+    Mirrors whose facets are not known are assumed to be canted for the target. The uncertainty of
+    their shift includes how much the shift changes if the focal lengths are a quarter longer or
+    shorter. In addition, every shift is uncertain by a quarter of its size.
     """
     place = heliostats.position
     own = np.full_like(place, np.nan) if heliostats.aim is None else heliostats.aim
@@ -144,7 +147,7 @@ def shift_of(
     *,
     unknown: float = UNKNOWN,
 ) -> tuple[FloatArray, npt.NDArray[np.float64], float]:
-    """Return the shift of a centroid caused by neighbours, its covariance, and the hidden fraction.
+    """Return a centroid's shift caused by neighbours, its covariance, and the obstructed fraction.
 
     Parameters
     ----------
@@ -157,13 +160,14 @@ def shift_of(
     center
         Middle of the mirror, ENU metres, (3,).
     neighbours
-        Mirrors beside it.
+        Neighbouring mirrors.
     unknown
         Fraction of the shift that remains uncertain.
 
     Returns
     -------
-        Right and up on the target, m, (2,), and m², (2, 2); zeros if nothing is hidden.
+        The shift right and up on the target, m, (2,); its covariance, m², (2, 2); and the fraction
+        of the mirror that is shaded or blocked. All are zero if nothing is obstructed.
     """
     slant = float(np.linalg.norm(centroid - center))
     normal = bisector(sun, (centroid - center) / slant)

@@ -1,11 +1,11 @@
 """PAINT's four official splits of a heliostat's measurements, by sun position or season.
 
-The rules are those of ``paint-csp`` 3.1 (``paint.data.dataset_splits``): for each heliostat a
-number of measurements for training, for validation, and at least as many for testing. If a
-heliostat has fewer measurements than PAINT requires, all numbers are reduced in proportion.
-Learning here needs no validation part, so that part is used neither for learning nor for testing.
-PAINT draws its clusters and samples with a different random generator, so the balanced split
-follows PAINT's rule but not its draw.
+The rules are those of ``paint-csp`` 3.1 (``paint.data.dataset_splits``). For each heliostat they
+set aside given numbers of measurements for training and for validation, and at least as many for
+testing as for validation. If a heliostat has fewer measurements than PAINT requires, all numbers
+are reduced in proportion. Learning here needs no validation part, so that part is used neither for
+learning nor for testing. PAINT draws its clusters and samples with a different random generator, so
+the balanced split follows PAINT's rule but does not pick the same measurements.
 """
 
 from datetime import UTC, datetime
@@ -19,7 +19,7 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray
 
 KINDS = ("azimuth", "solstice", "balanced", "high-variance")
-#: Measurements for training and for validation where a heliostat has enough for both and a test.
+#: Numbers of measurements for training and for validation if a heliostat has enough of them.
 TRAINING, VALIDATION = 100, 30
 #: Number of neighbours whose mean distance measures how isolated a measurement is.
 NEIGHBOURS = 3
@@ -30,20 +30,20 @@ Rows = npt.NDArray[np.intp]
 def paint_split(
     sightings: Sightings, kind: str, seed: int = 0
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Return the masks (M,) of the training and the test part.
+    """Return two masks (M,), of the training and of the test sightings.
 
     Parameters
     ----------
     sightings
         Sightings of the sun by any number of heliostats.
     kind
-        "azimuth": trained in the west, validated in the east, tested between. "solstice": trained
-        nearest to the winter's, validated nearest to the summer's, tested between. "balanced":
-        one for validation and one for testing from each of as many clusters of sun positions, the
-        others for training. "high-variance": validated and tested where the sun's neighbouring
-        positions are farthest away, trained where they are dense.
+        "azimuth": train in the west, validate in the east, test in between. "solstice": train on
+        the sightings nearest to the winter solstice, validate on those nearest to the summer
+        solstice, test in between. "balanced": take one sighting for validation and one for testing
+        from each of as many clusters of sun positions, and train on the rest. "high-variance":
+        validate and test where sun positions are sparse, train where they are dense.
     seed
-        Of the balanced split.
+        Seed of the balanced split.
     """
     training = np.zeros(len(sightings), dtype=np.bool_)
     tested = training.copy()
@@ -56,7 +56,7 @@ def paint_split(
             training[rows] = True
             continue
         sun = sightings.source[rows]
-        # From the south, east positive, as in PAINT.
+        # Azimuth from the south, positive to the east, as in PAINT.
         azimuth = np.degrees(np.arctan2(sun[:, 0], -sun[:, 1]))
         place = np.c_[azimuth, np.degrees(np.arcsin(np.clip(sun[:, 2], -1.0, 1.0)))]
         if kind == "azimuth":
@@ -75,7 +75,11 @@ def paint_split(
 
 
 def _ends(first: FloatArray, last: FloatArray, counts: tuple[int, int]) -> tuple[Rows, Rows]:
-    """Training has the smallest of ``first``, validation the smallest of ``last``."""
+    """Return the training and the test indices.
+
+    Training takes the smallest values of ``first``, validation the smallest of ``last``, and
+    testing the rest.
+    """
     training = np.argsort(first, kind="stable")[: counts[0]]
     validation = np.argsort(last, kind="stable")[: counts[1]]
     everything = np.arange(len(first))
@@ -84,7 +88,7 @@ def _ends(first: FloatArray, last: FloatArray, counts: tuple[int, int]) -> tuple
 
 
 def _from_solstice(time: FloatArray, month: int) -> FloatArray:
-    """Seconds to the nearest noon (UTC) of the 21st of a month; infinite at an unknown time."""
+    """Return the seconds to the nearest 21st of a month, noon UTC; infinity at an unknown time."""
     known = time[np.isfinite(time)]
     years = sorted({datetime.fromtimestamp(t, UTC).year for t in known}) or [2000]
     noons = [
@@ -105,7 +109,7 @@ def _balanced(
         validation.append(members[0])
         tested += list(members[1:2])
     pool = rng.permutation(np.setdiff1d(np.arange(len(place)), [*validation, *tested]))
-    # A cluster of one has no test sample; the pool gives it.
+    # A cluster of one sighting yields no test sighting; one is taken from the pool instead.
     missing = max(0, counts[1] - len(tested))
     tested += list(pool[:missing])
     return pool[missing : missing + counts[0]], np.array(tested, dtype=np.intp)

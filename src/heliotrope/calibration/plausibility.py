@@ -1,10 +1,10 @@
-"""Physical plausibility of sightings, judged in this one place for all sources.
+"""Physical plausibility of sightings, judged here for every source of sightings.
 
 Tables, measurement folders, photograph logs, flights and the plant's own cameras all call `judge`.
-It returns a reason for each sighting that is physically impossible; such a sighting is left out and
-named. If most sightings of a heliostat are contradicted, the fault does not lie in single
-sightings, and the fit judges the heliostat (`learn.misfits`). If most sightings of a source are
-contradicted, they stay and a note is returned.
+It returns a reason for each sighting that is physically impossible; the caller leaves such a
+sighting out and reports it. If most sightings of a heliostat are contradicted, the fault does not
+lie in single sightings; the sightings are kept, and the fit judges the heliostat (`learn.misfits`).
+If most sightings of a source are contradicted, they are kept and a note is returned.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,34 +25,37 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS
 from heliotrope.sun import Site
 
-#: Period of possible sightings, Unix seconds: no heliostat is older, and later times are typing
-#: errors.
+#: Period of possible sightings, Unix seconds. No heliostat is older than this period, and later
+#: times are typing errors.
 EARLIEST, LATEST = 0.0, datetime(2100, 1, 1, tzinfo=UTC).timestamp()
 YEAR = "the year is out of range, 1970 to 2099: correct the time"
-#: A time may be this far ahead of the computer's clock, which may be slow itself, s.
+#: A time may be this far ahead of the computer's clock, s, because that clock may be slow.
 AHEAD = 366 * 86400.0
-#: Lowest elevation of the sun's centre at which there is a beam: solar radius plus horizon dip,
-#: rad.
+#: Lowest elevation of the sun's centre at which there is a beam, rad; it allows for the solar
+#: radius and the horizon dip.
 LOWEST = float(np.radians(-0.5))
-#: Largest angle between a stated sun vector and the sun at the stated time, rad: four minutes.
+#: Largest angle between a stated sun vector and the sun at the stated time, rad. The sun takes four
+#: minutes to move by this angle.
 MOVED = float(np.radians(1.0))
 #: Largest angle of incidence, rad; beyond it the mirror is seen edge-on.
 EDGE_ON = float(np.radians(89.0))
-#: Angle beyond a stop, or behind a mirror, that uncalibrated zeros may explain, rad.
+#: Angle beyond a stop, or behind a mirror, that uncalibrated drive zeros may explain, rad.
 PLAY = float(np.radians(5.0))
-#: A destination may lie off its surface, m, and beyond its border by this share of its size.
+#: A destination may lie this far off its surface, m, and beyond its border by this fraction of its
+#: size.
 OFF, BEYOND = 0.5, 0.5
 #: A point closer to the mirror than this lies on the mirror itself, m.
 NEAREST = 0.5
 #: Sightings with the same counts and the same point are one reading if their sun vectors differ by
-#: less than this, rad: a minute. The centroids of two photographs differ in their last digit.
+#: less than this, rad, which is a minute of sun motion. The centroids of two photographs always
+#: differ in their last digit.
 SAME = float(np.radians(0.25))
-#: A beam at the same point in this many sightings or more, at different sun positions, was not
-#: measured.
+#: If a beam is at the same point in this many sightings or more, at different sun positions, it was
+#: not measured.
 REPEATED = 3
 
 Rows = npt.NDArray[np.bool_]
-#: One reason for all refused rows, or one reason per row.
+#: One reason for all refused sightings, or one reason for each of them.
 Texts = str | Sequence[str]
 
 
@@ -65,7 +68,7 @@ class Judgement:
     reasons
         Why a sighting is impossible, by its index.
     notes
-        Notes on contradictions that affect most of the sightings; these sightings stay.
+        Notes on contradictions that affect most of the sightings; these sightings are kept.
     """
 
     reasons: Mapping[int, str] = field(default_factory=dict)
@@ -90,15 +93,16 @@ def judge(
     sightings
         M sightings.
     mechanism
-        The mechanisms of the heliostats, (N,): to check stops, light behind a mirror, points on it.
+        Mechanisms of the heliostats, (N,), used to check stops, light from behind a mirror and
+        points on a mirror.
     site
-        To check the sun position at the time of each sighting.
+        Site, used to check the sun position at the time of each sighting.
     surfaces
-        Targets and receivers of the plant: to check the destinations of kind "camera_target".
+        Targets and receivers of the plant, used to check the destinations of kind "camera_target".
     kinds
-        Kind of each sighting, (M,), empty if unknown.
+        Kind of each sighting, (M,); an empty string if unknown.
     now
-        The computer's clock, Unix seconds: to check for times in the future.
+        Time by the computer's clock, Unix seconds, used to check for times in the future.
     """
     reasons: dict[int, str] = {}
     for rows, text in _impossible(sightings, now):
@@ -144,7 +148,7 @@ def judge_in(
 
 
 def _add(reasons: dict[int, str], rows: Rows, texts: Texts) -> None:
-    """Assign a reason, common or per row, to the rows that have none yet."""
+    """Assign a reason, common or one per sighting, to the sightings that have no reason yet."""
     places = np.flatnonzero(rows)
     row_texts = [texts] * len(places) if isinstance(texts, str) else texts
     for i, text in zip(places, row_texts, strict=True):
@@ -193,7 +197,7 @@ def copies(sightings: Sightings) -> Rows:
 
 
 def _repeated(sightings: Sightings, photographed: Rows, reasons: Mapping[int, str]) -> Rows:
-    """Return the camera sightings of heliostats that moved although their beam never did."""
+    """Return the camera sightings of heliostats that moved while their beam stayed in one place."""
     rows = photographed & ~np.isin(np.arange(len(sightings)), list(reasons))
     mirror = sightings.heliostat[rows]
     if not len(mirror):
@@ -212,7 +216,7 @@ def _repeated(sightings: Sightings, photographed: Rows, reasons: Mapping[int, st
 def _contradicted(
     sightings: Sightings, site: Site, reasons: Mapping[int, str]
 ) -> tuple[Rows, Texts, str]:
-    """Return the sun vectors that are wrong for their time; a note if most of a heliostat's are."""
+    """Return the sightings whose sun vector is wrong for their time, the reasons, and a note."""
     able = sightings.source_at_infinity & np.isfinite(sightings.time)
     able[list(reasons)] = False
     if not able.any():
@@ -270,7 +274,7 @@ def _off_target(
 def _beyond_machine(
     sightings: Sightings, mechanism: Mechanism, reasons: Mapping[int, str]
 ) -> Iterator[tuple[Rows, Texts]]:
-    """Yield the sightings that are beyond their heliostat's abilities."""
+    """Yield the sightings that their heliostat's mechanism cannot produce."""
     mirrors = mechanism[sightings.heliostat]
     pose = mirrors.pose(sightings.counts)
     near = np.zeros(len(sightings), np.bool_)
@@ -287,7 +291,8 @@ def _beyond_machine(
         edge = ~near & ~(size > 2.0 * np.cos(EDGE_ON))
         miss = angle_between(pose.normal, total / np.maximum(size, 1e-9)[:, None])
     yield edge, f"the beam passes the mirror edge-on, {np.degrees(EDGE_ON):.0f}° from its normal"
-    # A nominal mechanism judges sightings only if it holds for most sightings of its heliostat.
+    # Sightings are judged by the nominal mechanism only if it suits most of the heliostat's
+    # sightings.
     good = np.flatnonzero(~(near | edge) & ~np.isin(np.arange(len(sightings)), list(reasons)))
     holds = np.zeros(len(mechanism), np.bool_)
     for row in np.unique(sightings.heliostat[good]):
@@ -316,7 +321,7 @@ def _beyond_machine(
 def _reach(
     mirrors: Mechanism, counts: FloatArray, drive: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, str]:
-    """Return a drive's values, its limits with tolerance, the most a zero explains, and the unit.
+    """Return a drive's values, its two limits, the tolerance for its zero, and the unit.
 
     All have shape (M,), in counts if the drive has count limits, otherwise in degrees.
     """

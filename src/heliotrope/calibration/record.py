@@ -1,9 +1,9 @@
-"""The belief about one heliostat: the record that a calibration creates, once.
+"""The record of one heliostat's calibration, which each calibration creates once.
 
 The learner creates a `HeliostatCalibration` from a fit. All users (automatic control, schedule,
-beam checks, local controllers, store, pages) hold a reference to the same record; none of them fits
-or inverts again. `CalibrationOutcome` is the outcome of an attempt, whether or not it produced a
-record.
+beam checks, local controllers, store, pages) hold a reference to the same record, and none of them
+repeats the fit or the inversion. `CalibrationOutcome` is the outcome of an attempt, whether or not
+it produced a record.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ class Provenance(StrEnum):
     CAMERA = "camera"
     DRONE = "drone"
     TABLE = "table"
-    #: Without sightings: an operator has set the values.
+    #: An operator has set the values, without sightings.
     PERSON = "person"
 
 
@@ -52,16 +52,16 @@ class CalibrationOutcome(StrEnum):
     IMPLAUSIBLE = "implausible"
     POOR_FIT = "poor_fit"
     NO_BETTER = "no_better"
-    #: A photograph did not confirm the new parameters; the old ones have been restored.
+    #: A photograph did not confirm the new parameters, so the old parameters have been restored.
     NOT_VERIFIED = "not_verified"
     #: In a joint visit, no beam was identified as this heliostat's.
     NOT_PROVEN = "not_proven"
     REFUSED = "refused"
-    #: An order that the heliostat had not caused, such as an operator's or an emergency, took it
-    #: out of the visit.
+    #: An order from elsewhere, such as an operator's command or an emergency, took the heliostat
+    #: out of the calibration visit.
     TAKEN_OUT = "taken_out"
     ERROR = "error"
-    #: Unchanged for a reason that was not recorded.
+    #: The parameters are unchanged, for a reason that was not recorded.
     UNCHANGED = "unchanged"
 
     @property
@@ -96,34 +96,34 @@ class HeliostatCalibration(Value, Framed):
     prior
         Standard deviations of the priors behind the covariance, (P,).
     before, after
-        Beam error over the sightings under the nominal and the calibrated mechanism, rad RMS;
+        Beam error over the sightings with the nominal and with the calibrated mechanism, rad RMS;
         NaN if unknown.
     scale
-        Noise found, in units of the sightings' sigma.
+        Estimated noise, in units of the sightings' sigma.
     outcome
         How the fit ended.
     sightings, left_out
-        Numbers of the sightings used, (M,), and of those left out of the fit, as assigned by the
-        store; 0 for a sighting that no store keeps.
+        Store identifiers of the sightings used, (M,), and of the sightings left out of the fit; 0
+        for a sighting that is not in a store.
     residual_before, residual_after
         Beam error of each sighting used, to the right of and above the destination as seen from
-        the mirror, under the nominal and the calibrated mechanism, rad, (M, 2).
+        the mirror, with the nominal and with the calibrated mechanism, rad, (M, 2).
     model
         Name of the model.
     provenance
         Source of the sightings.
     person, campaign, note
-        Who calibrated it, in which campaign, and remarks.
+        Who calibrated the heliostat, in which campaign, and remarks.
     pushed
         Items written to the local controller and read back.
     code
         Version of the program.
     version
-        1, 2, ... for each heliostat; 0 before it is numbered.
+        Version number, counted from 1 for each heliostat; 0 before a number is assigned.
     growth
-        How the covariance grows after the fit. The growth belongs to the group: a fit sets the
-        default for its kind of mechanism, the plant's beliefs replace it with that of the group,
-        and it is not stored with the record.
+        How the covariance grows after the fit. The fit sets the default growth for the kind of
+        mechanism; the plant then replaces it with the growth learnt for the heliostat's group. The
+        growth is not stored with the record.
 
     Raises
     ------
@@ -228,7 +228,7 @@ class HeliostatCalibration(Value, Framed):
         pushed: tuple[str, ...] = (),
         version: int = 0,
     ) -> Self:
-        """Return the record of a fit of one heliostat.
+        """Return the record of one heliostat's fit.
 
         Parameters
         ----------
@@ -237,11 +237,12 @@ class HeliostatCalibration(Value, Framed):
         fitted
             A fit of batch shape (1,).
         nominal
-            The mechanism that the values deviate from, batch shape (1,).
+            The mechanism from which the values deviate, batch shape (1,).
         sightings, identities
-            The sightings given to the fit (heliostat row 0), and their numbers, (M,).
+            The sightings passed to the fit, with heliostat index 0, and their store identifiers,
+            (M,).
         used
-            Mask of the sightings that the fit used, (M,); default all.
+            Mask of the sightings that the fit used, (M,); default: all.
         model, provenance, person, campaign, note, pushed, version
             See the attributes.
 
@@ -314,20 +315,20 @@ class HeliostatCalibration(Value, Framed):
     def covariance_at(self, time: npt.ArrayLike) -> FloatArray:
         """Return the covariance of the values at POSIX times (...), (..., P, P).
 
-        It grows with the time since the fit as the group's parameters drift. For many records of
-        one group see `covariances_at`.
+        The covariance grows with the time since the fit, because the group's parameters drift. For
+        many records of one group, see `covariances_at`.
         """
         days = (np.asarray(time, dtype=np.float64) - self.at) / DAY
         return self.growth.grown(self.covariance, self.names, days)
 
     def growing(self, growth: Growth) -> Self:
-        """Return the same calibration with another growth of its covariance after the fit."""
+        """Return the same calibration with a different growth of its covariance after the fit."""
         other = copy(self)
         object.__setattr__(other, "growth", growth)
         return other
 
     def mechanism(self, nominal: Mechanism) -> Mechanism:
-        """Return the calibrated mechanism, in the batch shape of the nominal one."""
+        """Return the calibrated mechanism, in the batch shape of the nominal mechanism."""
         return nominal.with_parameters(self.parameters)
 
 

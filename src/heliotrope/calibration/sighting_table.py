@@ -1,7 +1,7 @@
 """Sighting tables: all kinds of sighting in one CSV or Parquet file, and Malan's own CSV.
 
 Each row is one sighting. A row that cannot be used is left out and reported in one line (file,
-line, heliostat, column, value, remedy); a file that cannot be used raises an error.
+line, heliostat, column, value, remedy). A file that cannot be used raises an error.
 """
 
 import csv
@@ -39,7 +39,7 @@ from heliotrope.files.times import format_time
 from heliotrope.geometry import FloatArray, direction
 from heliotrope.sun.ephemeris import END_OF_TIMES
 
-#: Kinds of sightings, with whether source and destination are at infinity.
+#: Kinds of sightings, and whether their source and destination are at infinity.
 KINDS = {
     "camera_target": (True, False),
     "drone": (False, False),
@@ -70,15 +70,15 @@ def read_sightings(
     Parameters
     ----------
     path
-        A file ``.csv`` (comma, semicolon or tab; with or without a byte-order mark) or
-        ``.parquet``, with the columns of `write_sightings`. Columns ``time``, ``kind`` and
-        the covariances are optional; ``sigma_mrad`` may replace ``sigma_rad``. A missing time
-        is NaN. Other columns are ignored.
+        A ``.csv`` file (comma, semicolon or tab; with or without a byte-order mark) or a
+        ``.parquet`` file, with the columns of `write_sightings`. Columns ``time``, ``kind`` and the
+        covariances are optional; ``sigma_mrad`` may replace ``sigma_rad``. A missing time is NaN.
+        Other columns are ignored.
     names
         Names of the heliostats in the order of their indices, (N,).
     judge
-        Function that returns the impossible sightings, by index, with the reason; it is called with
-        all sightings and their kinds. See `heliotrope.calibration.plausibility`.
+        Function that is called with all sightings and their kinds, and returns the impossible
+        sightings by index, with the reason. See `heliotrope.calibration.plausibility`.
 
     Returns
     -------
@@ -127,7 +127,7 @@ def read_sightings(
 
 
 def _times(rows: Rows, column: str, *, optional: bool) -> FloatArray:
-    """Return Unix seconds; times that sightings cannot hold leave their rows out."""
+    """Return Unix seconds; a row with a time that sightings cannot hold is left out."""
     seconds = rows.times(column, optional=optional)
     for i in np.flatnonzero(seconds >= END_OF_TIMES):
         rows.refuse(i, column, plausibility.YEAR)
@@ -135,7 +135,7 @@ def _times(rows: Rows, column: str, *, optional: bool) -> FloatArray:
 
 
 def _without(rows: Rows, sightings: Sightings, reasons: Mapping[int, str]) -> Sightings:
-    """Refuse the rows of sightings with a reason, and return the others."""
+    """Reject the rows of sightings that have a reason, and return the other sightings."""
     good = rows.good
     rows.reasons |= {int(good[k]): ("", reason) for k, reason in reasons.items()}
     return sightings.take(np.isin(good, rows.good))
@@ -152,7 +152,7 @@ def write_sightings(
     Parameters
     ----------
     path
-        A file ``.csv`` or ``.parquet``, written completely or not at all.
+        A ``.csv`` or ``.parquet`` file, written completely or not at all.
     sightings
         M sightings.
     names
@@ -195,7 +195,7 @@ def read_malan(
         ``vertical_offset_m`` (of the centroid from the aim point, to the right as seen from
         the heliostats, and up), ``azimuth_counts`` and ``elevation_counts``.
     heliostat
-        Name of the heliostat measured.
+        Name of the measured heliostat.
     names
         Names of all heliostats, (N,).
     target
@@ -270,7 +270,7 @@ def _is_parquet(path: Path) -> bool:
 
 
 def _check_columns(rows: Rows) -> list[str]:
-    """Return the columns of counts; refuse missing and misspelt columns."""
+    """Return the names of the count columns; raise an error for missing or misspelt columns."""
     ends = [f"{end}_{axis}" for end in _ENDS for axis in (*_AXES, "at_infinity")]
     rows.need(["heliostat", "count_1", *ends])
     columns = list(rows.columns)
@@ -334,7 +334,7 @@ def _sigma(rows: Rows) -> FloatArray:
     name = "sigma_rad" if "sigma_rad" in rows.columns else "sigma_mrad"
     unit = name.removeprefix("sigma_")
     values = rows.numbers(name, f"the ray's standard deviation in {unit}")
-    # Division rounds once; 1e-3 itself is not exact in binary.
+    # Dividing by 1000 rounds once; multiplying by 1e-3, which is not exact in binary, rounds twice.
     scale = 1.0 if unit == "rad" else 1e3
     sigma = values / scale
     rows.check(
@@ -352,7 +352,7 @@ def _covariance(rows: Rows, end: str) -> FloatArray:
     if f"{end}_cov_ee" not in rows.columns:
         return matrices
     names = {pair: f"{end}_cov_{pair}" for pair in _PAIRS}
-    # All six cells empty: no covariance. Some of them empty: a mistake.
+    # If all six cells are empty, there is no covariance; if only some are, it is a mistake.
     filled = np.array([rows.filled(name) for name in names.values()])
     some = filled.any(axis=0)
     what = "m² of a point or rad² of a direction, or leave all six empty"
@@ -413,7 +413,7 @@ def _write_csv(path: Path, columns: dict[str, list[Any]], stream: BinaryIO) -> N
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
-    # `repr` gives the shortest text that reads back as the same number.
+    # `repr` produces the shortest text that reads back as the same number.
     cells: Iterable[list[Any]] = (
         ["true" if c else "false" for c in column] if name.endswith("_at_infinity") else column
         for name, column in columns.items()

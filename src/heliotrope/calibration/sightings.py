@@ -20,10 +20,10 @@ from heliotrope.geometry import FloatArray, as_float, as_numbers, azimuth_elevat
 from heliotrope.sun import Times, unix_seconds
 from heliotrope.values import Card, Value, amount, dots, span
 
-#: Standard deviations of a ray, rad: no camera resolves less than the smallest, and values in
-#: milliradians or degrees are mostly larger than the largest.
+#: Smallest and largest standard deviation of a ray, rad. No camera resolves less than the smallest,
+#: and values mistakenly in milliradians or degrees are mostly larger than the largest.
 SMALLEST_SIGMA, LARGEST_SIGMA = 1e-6, 0.2
-#: Largest deviation from 1 of the length of a normalised vector: a few roundings.
+#: Largest deviation from 1 of the length of a normalised vector, due to a few roundings.
 _UNIT = 2e-15
 
 
@@ -47,8 +47,8 @@ class Sightings(Value, Framed):
         Standard deviation of the ray's direction (source and destination together) in
         each of two directions across it, rad of beam, (M,).
     source_covariance, destination_covariance
-        Additional covariance of each end, ENU, (M, 3, 3): m² for a point, rad² for a direction, of
-        which only the part across the direction counts.
+        Additional covariance of each end, ENU, (M, 3, 3), in m² for a point and rad² for a
+        direction. For a direction only the part across the direction counts.
     names
         Names of the heliostats by index, (N,); () if the indices refer to mechanisms passed
         alongside.
@@ -84,7 +84,7 @@ class Sightings(Value, Framed):
                 for d in range(self.counts.shape[-1])
             ),
         ]
-        # The sky from below: the zenith in the middle, north up, west to the left.
+        # The sky is drawn with the zenith in the middle, north at the top and west to the left.
         sky = 0.5 * np.pi - elevation
         picture = dots(sky * np.sin(azimuth), sky * np.cos(azimuth), "suns from the zenith")
         return Card(f"{len(self)} of {some}, {when}", ("what", "range"), rows, picture)
@@ -123,12 +123,12 @@ class Sightings(Value, Framed):
     def take(self, rows: npt.ArrayLike) -> "Sightings":
         """Return the sightings at indices ``rows`` (or a mask), in that order."""
         index = np.asarray(rows)
-        # NumPy makes an array of floats of an empty list.
+        # NumPy turns an empty list into an array of floats.
         index = index if index.size else index.astype(np.intp)
         return replace(self, **{name: getattr(self, name)[index] for name in _COLUMNS})
 
     def of(self, heliostat: int | str) -> "Sightings":
-        """Return the sightings of one heliostat, by index or name, renumbered to 0.
+        """Return the sightings of one heliostat, given by index or name, with heliostat index 0.
 
         Raises
         ------
@@ -146,11 +146,11 @@ class Sightings(Value, Framed):
         )
 
     def renumbered(self, rows: npt.ArrayLike) -> "Sightings":
-        """Return the sightings assigned to other mechanisms, by index (M,) and without names."""
+        """Return the sightings with other heliostat indices, (M,), and without names."""
         return replace(self, heliostat=np.asarray(rows, dtype=np.intp), names=())
 
     def __getitem__(self, heliostat: str) -> "Sightings":
-        """Return the sightings of one heliostat by name; see `of`."""
+        """Return the sightings of one heliostat, given by name; see `of`."""
         return self.of(heliostat)
 
 
@@ -177,8 +177,8 @@ def sightings(
     """Return checked sightings; all arguments broadcast to the M rows of ``counts``.
 
     Counts with several batch axes, such as (T, N, D) for N heliostats at T times, produce one
-    sighting per element, the last axis varying fastest; all other arguments broadcast to (T, N),
-    and a list of times runs along the first axis.
+    sighting per element, with the last batch axis varying fastest. All other arguments broadcast to
+    (T, N), and a list of times runs along the first axis.
 
     Parameters
     ----------
@@ -190,14 +190,15 @@ def sightings(
         Directions (of any length) or points (m), ENU, (M, 3). A direction of length 1 is kept
         unchanged to the last bit.
     time
-        See `heliotrope.sun.Times`, () or (M,); NaN: unknown.
+        See `heliotrope.sun.Times`, () or (M,); NaN if unknown.
     source_at_infinity, destination_at_infinity
-        Whether each end is at infinity: the sun is, the centroid on a target is not.
+        Whether each end is at infinity. The sun is at infinity; a centroid on a target is not.
     sigma
         Standard deviation of the ray's direction, rad of beam, (M,).
     source_covariance, destination_covariance
-        Covariances of the ends, in addition to sigma; m² for a point and rad² for a direction: a
-        variance equal in every direction, () or (M,), or matrices, (3, 3) or (M, 3, 3).
+        Covariances of the ends, in addition to sigma, in m² for a point and rad² for a direction.
+        Either a variance that is equal in every direction, () or (M,), or matrices, (3, 3) or (M,
+        3, 3).
 
     Raises
     ------
@@ -259,11 +260,11 @@ def sightings(
 
 
 def _numbers(values: npt.ArrayLike, name: str) -> FloatArray:
-    """Return an array of numbers, some of which may be NaN: the row is named later."""
+    """Return an array of numbers; NaN is allowed here, and refused later with its index."""
     try:
         return as_float(values)
     except (TypeError, ValueError):
-        # Its error says what is wrong.
+        # The error raised by `as_float` says what is wrong.
         return as_numbers(values, f"sightings: {name}")
 
 
@@ -291,7 +292,7 @@ def _heliostats(heliostat: npt.ArrayLike, batch: tuple[int, ...]) -> npt.NDArray
 
 
 def _named(heliostat: npt.ArrayLike) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return rows and their names, in the order in which the names occur; () for rows."""
+    """Return heliostat indices, and names in order of first appearance; () if passed as indices."""
     labels = np.asarray(heliostat)
     if labels.dtype.kind not in "UO":
         return labels, ()
@@ -332,7 +333,7 @@ def _covariances(covariance: npt.ArrayLike, rows: int, name: str) -> FloatArray:
 def is_covariance(matrices: FloatArray) -> npt.NDArray[np.bool_]:
     """Return a mask of the matrices (M, 3, 3) that are finite, symmetric and positive semidefinite.
 
-    Tolerance: 1e-9 of the largest entry. Entries above 1e100 count as infinite.
+    The tolerance is 1e-9 of the largest entry. Entries above 1e100 count as infinite.
     """
     largest = np.abs(matrices).max(axis=(-1, -2))
     # Most matrices are zero and need no eigenvalues.
@@ -365,14 +366,14 @@ def ray_directions(s: Sightings, vertex: npt.ArrayLike) -> tuple[FloatArray, Flo
 
 
 def bisector_covariance(s: Sightings, vertex: npt.ArrayLike, axes: npt.ArrayLike) -> FloatArray:
-    r"""Return the covariance of the bisectors of source and destination, (M, 2, 2), rad².
+    r"""Return the covariance of the bisectors of source and destination, rad², (M, 2, 2).
 
     With s and t the unit vectors to both ends and v their bisector, to first order
 
     $$ δv = (I - v v^T)(δs + δt) / |s + t| $$
 
     where a shift δp of a point at distance d turns its direction by
-    $δs = (I - s s^T) δp / d$. The two ends are taken as independent.
+    $δs = (I - s s^T) δp / d$. The errors of the two ends are taken as independent.
 
     Parameters
     ----------
@@ -387,8 +388,8 @@ def bisector_covariance(s: Sightings, vertex: npt.ArrayLike, axes: npt.ArrayLike
     rays = ray_directions(s, m)
     size = np.linalg.norm(rays[0] + rays[1], axis=-1)
     across = as_float(axes) / size[:, None, None]
-    # A turn ε of the ray t turns the bisector by the part of ε across the normal over |s + t|:
-    # all of it across the plane of incidence, cos i of it within the plane.
+    # A rotation ε of the ray t rotates the bisector by the part of ε across the normal, over |s +
+    # t|. That part is all of ε across the plane of incidence, and ε cos i within the plane.
     turn = np.eye(3) - rays[1][:, :, None] * rays[1][:, None, :]
     covariance = across @ turn @ np.swapaxes(across, -1, -2) * s.sigma[:, None, None] ** 2
     for ray, points, far, end_covariance in (
@@ -446,7 +447,7 @@ def camera_target(
     sun_covariance: npt.ArrayLike = 0.0,
     centroid_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
-    """Return sightings of the sun's image on a target (Malan): from the sun to the centroid.
+    """Return sightings from the sun to the centroid of its image on a target (Malan).
 
     Parameters
     ----------
@@ -457,7 +458,7 @@ def camera_target(
     centroid
         Centroid of the image on the target, ENU metres, (M, 3).
     sun_covariance, centroid_covariance
-        rad² and m², as for `sightings`.
+        Covariances in Covariances in rad² and m², as for `sightings`.
     """
     return sightings(
         heliostat,
@@ -482,7 +483,7 @@ def drone(
     led_covariance: npt.ArrayLike = 0.0,
     camera_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
-    """Return sightings of a lamp's reflection seen from a drone (HelioPoint): lamp to camera.
+    """Return sightings from a lamp to the drone camera that sees the reflection (HelioPoint).
 
     Parameters
     ----------
@@ -491,9 +492,9 @@ def drone(
     led, camera
         Position of the lamp, and centre of projection of the camera, ENU metres, (M, 3).
     led_covariance, camera_covariance
-        m², as for `sightings`. The two covariances are taken as independent. If the lamp is mounted
-        beside the camera, an error in the drone's position moves both: pass four times its variance
-        for one end and 0 for the other.
+        Covariances in m², as for `sightings`. The two ends are taken as independent. If the lamp is
+        mounted beside the camera, an error in the drone's position moves both: pass four times its
+        variance for one end and 0 for the other.
     """
     return sightings(
         heliostat,
@@ -517,14 +518,14 @@ def sun_sensor(
     normal_sigma: npt.ArrayLike = 2.5e-4,
     normal_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
-    """Return sightings of a sensor that keeps the mirror normal to the sun: from sun to sun.
+    """Return sightings, from the sun to the sun, of a sensor that keeps the mirror facing the sun.
 
     Parameters
     ----------
     heliostat, counts, time
         As for `sightings`.
     sun
-        Directions to the apparent sun while the loop was closed, ENU, (M, 3).
+        Directions to the apparent sun while the sensor controlled the mirror, ENU, (M, 3).
     normal_sigma
         Standard deviation of the mirror normal, rad, (M,); the ray turns by twice that angle.
     normal_covariance
@@ -554,7 +555,7 @@ def field_camera(
     sun_covariance: npt.ArrayLike = 0.0,
     camera_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
-    """Return sightings of the sun seen in the mirror by a field camera (eSolar): sun to camera.
+    """Return sightings from the sun to a field camera that sees the sun in the mirror (eSolar).
 
     Parameters
     ----------
@@ -567,7 +568,7 @@ def field_camera(
     sun_covariance, camera_covariance
         rad² and m², as for `sightings`.
     """
-    # For the law of reflection a camera is a target: sunlight reached this point.
+    # For the law of reflection a camera is like a target, because sunlight reached this point.
     return camera_target(
         heliostat,
         counts,
@@ -581,7 +582,7 @@ def field_camera(
 
 
 def join(parts: Iterable[Sightings]) -> Sightings:
-    """Join sightings of several kinds or campaigns, in the order given.
+    """Join sightings of several kinds or campaigns, in the order of the arguments.
 
     Raises
     ------

@@ -4,8 +4,8 @@ Priors and sightings determine `precision`, the information on the parameters; i
 covariance C. Let B be the derivative of the beam direction with respect to the parameters. The beam
 from one sun position to one aim has the covariance B C Bᵀ (`expected_error`); over many sun
 positions the mean squared error is tr(F C) with F the mean of BᵀB (`error_form`). `unobservable`
-names what the sightings leave to the prior, and `year_map` shows the error for every sun position
-in the year.
+names the combinations of parameters that the sightings leave to the prior, and `year_map` shows the
+error for every sun position in the year.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,12 +25,12 @@ from heliotrope.mechanism.tracking import track
 from heliotrope.optics.beam import ExpectedError
 from heliotrope.sun import Site
 
-#: Poses evaluated at a time: about 20 MB of derivatives.
+#: Number of poses evaluated at a time, which takes about 20 MB for derivatives.
 CHUNK = 40_000
 #: Default lowest elevation of the sun, rad.
 MIN_ELEVATION = float(np.radians(10.0))
-#: A combination of parameters is known by the prior only if the sightings leave more than this
-#: share of its prior variance.
+#: If the sightings leave more than this fraction of its prior variance, a combination of parameters
+#: is known only from the prior.
 PRIOR_ONLY = 0.9
 
 
@@ -41,7 +41,7 @@ def precision(
     *,
     priors: Mapping[str, npt.ArrayLike] | None = None,
 ) -> FloatArray:
-    """Return the information from priors and sightings on the parameters, (N, P, P).
+    """Return the information on the parameters from priors and sightings, (N, P, P).
 
     Parameters
     ----------
@@ -94,12 +94,12 @@ def expected_error(
     *,
     current: npt.ArrayLike | None = None,
 ) -> ExpectedError:
-    """Return the expected beam errors of mechanisms that track by their calibration.
+    """Return the expected beam errors of mechanisms that track with their calibration.
 
     Parameters
     ----------
     mechanism
-        Calibrated mechanisms: one, or M.
+        One calibrated mechanism, or M of them.
     names
         The P parameters of ``covariance``.
     covariance
@@ -115,7 +115,7 @@ def expected_error(
 
     Notes
     -----
-    First order in the parameters: exact to 1 % for errors of 10 mrad.
+    The result is first order in the parameters, which is exact to 1 % for errors of 10 mrad.
     """
     suns, aims = np.atleast_2d(as_float(sun)), np.atleast_2d(as_float(aim))
     count = max(len(suns), len(aims))
@@ -148,14 +148,14 @@ def error_form(
         Aim points in operation, ENU metres, (3,) or (N, 3).
     suns
         K unit vectors of equal weight, (K, 3), for example from `suns_of_year`. Sun vectors for
-        which a heliostat cannot reach its aim do not count for that heliostat; if it can reach its
-        aim for none, its form is 0.
+        which a heliostat cannot reach its aim do not count for that heliostat. If it cannot reach
+        its aim for any of them, its form is 0.
     names
         P parameters of the table.
 
     Notes
     -----
-    First order in the parameters: exact to 1 % for errors of 10 mrad.
+    The result is first order in the parameters, which is exact to 1 % for errors of 10 mrad.
     """
     count = _batch(mechanism)
     aims = np.broadcast_to(as_vectors(aim, "aim"), (count, 3))
@@ -173,7 +173,7 @@ def error_form(
         counts = solved.best_counts[which, row]
         slope = _beam_slope(some[row], counts, sky[which], aims[part][row], names)
         poses = able.sum(axis=1)
-        # `nonzero` lists the poses heliostat by heliostat.
+        # `nonzero` lists the poses sorted by heliostat.
         edges = np.concatenate([[0], np.cumsum(poses)])
         for i in np.flatnonzero(poses):
             flat = slope[edges[i] : edges[i + 1]].reshape(-1, len(names))
@@ -188,7 +188,7 @@ def _beam_slope(
     aims: FloatArray,
     names: tuple[str, ...],
 ) -> FloatArray:
-    """Derivative of the beam's direction by the parameters at M poses, (M, 2, P)."""
+    """Return the derivative of beam direction with respect to parameters at M poses, (M, 2, P)."""
     observed = sightings(np.arange(len(counts)), counts, suns, aims)
     line = linearise(mechanism, observed, names)
     return np.asarray(line.beam @ line.jacobian)
@@ -228,7 +228,8 @@ def suns_of_year(
         )
     begin = datetime(year, 1, 1, tzinfo=UTC).timestamp()
     noon = begin + (np.arange(days) + 0.5) * 365.25 * 86400.0 / days
-    # The golden ratio shifts the hours from day to day; otherwise all days would show the same.
+    # The golden ratio shifts the hours from day to day; otherwise all days would have the same
+    # hours.
     shift = np.modf(np.arange(days) * 0.618034)[0]
     offsets = np.arange(0.0, 24.0, hours)
     times = noon[:, None] + 3600.0 * (offsets + hours * shift[:, None])
@@ -251,11 +252,11 @@ class BlindSpot:
     text
         Description in one clause, for display.
     loadings
-        Parameters with their shares, largest first, in units of their priors.
+        Parameters with their contributions, in units of their priors, largest first.
     remaining
         Remaining fraction of the prior variance, 0 to 1.
     beam
-        RMS beam error that the combination causes, rad; NaN if no beams were passed.
+        RMS beam error that the combination causes, rad; NaN if no ``slope`` was passed.
     """
 
     text: str
@@ -334,7 +335,8 @@ class YearMap:
         Centres of the grid cells, rad: declination of the sun (D,), and hour angle from true noon,
         west positive (H,).
     rms
-        rad, (D, H); NaN where the sun is below the horizon or the pose is out of reach.
+        Expected RMS error, rad, (D, H); NaN where the sun is below the horizon or the pose is out
+        of reach.
     """
 
     declination: FloatArray
@@ -356,7 +358,7 @@ def year_map(
     Parameters
     ----------
     mechanism
-        One, calibrated.
+        One calibrated mechanism.
     names, covariance, noise
         As for `expected_error`.
     aim
@@ -364,7 +366,7 @@ def year_map(
     latitude_deg
         Latitude of the site, °.
     size
-        Steps of declination and of hour angle.
+        Numbers of grid cells in declination and in hour angle.
     """
     declination = np.radians(np.linspace(-23.43, 23.43, size[0]))
     hour = np.radians(np.linspace(-120.0, 120.0, size[1]))

@@ -1,4 +1,4 @@
-"""Calibrates a field from its files: read the sightings, choose a model, learn, test, report.
+"""Calibrate a field from its files: read the sightings, choose a model, learn, test, report.
 
 `read_field_sightings` reads a folder or a table, `calibrate` returns the content of a report, and
 `evaluate` only tests how well held-out sightings are predicted.
@@ -40,7 +40,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.mechanism.chain import Mechanism
 
-#: Learners that the sequential split may use after training.
+#: Learners that may be used after training with the split "sequential".
 Learner = Literal["stream", "batch"]
 #: Function called with (name of the step, done, total).
 Steps = Callable[[str, int, int], None]
@@ -98,7 +98,7 @@ def read_field_sightings(
     centroid
         Which published centroid to use.
     now
-        The computer's clock, Unix seconds; sightings with times in the future are left out.
+        Time by the computer's clock, Unix seconds; sightings with later times are left out.
 
     Raises
     ------
@@ -183,7 +183,7 @@ class ModelChoice:
         Nominal mechanisms, (N,), with the ratios of the periodic errors that were found and
         included.
     scores
-        All models compared; empty if there are too few sightings.
+        Scores of all compared models; empty if there are too few sightings.
     periodic
         The best periodic error of each drive whose ratio is unknown, significant or not.
     """
@@ -213,7 +213,7 @@ def find_model(
     Parameters
     ----------
     mechanism
-        Nominal, (N,).
+        Nominal mechanisms, (N,).
     sightings
         M sightings of these heliostats; if there are too few for a comparison, the smallest model
         is returned without scores.
@@ -288,8 +288,8 @@ def evaluate(
 ) -> HeldOutEvaluation:
     """Learn from a part of each heliostat's sightings and assess the rest.
 
-    Everything, including the model and the hyperparameters of the field, is learnt from the
-    training part alone.
+    Everything, including the model and the hyperparameters of the field, is learnt only from the
+    training part.
 
     Parameters
     ----------
@@ -298,7 +298,7 @@ def evaluate(
     sightings
         M sightings of these heliostats.
     model
-        Name of a model, names of parameters, or "auto".
+        Name of a model, names of parameters, or "auto" to have the model chosen.
     split, fraction, seed
         How to choose the training part; see `heliotrope.calibration.evaluation.split`.
     priors
@@ -369,7 +369,7 @@ def calibrate(
     model, split, seed, priors, runner, steps
         As for `evaluate`; the model is chosen once, from all sightings.
     fraction
-        Training fraction in the test; 1: no test.
+        Training fraction in the test; 1 for no test.
     """
     require("field", field, FieldSightings, "the result of read_field_sightings")
     require("fraction", fraction, numbers.Real, "a share from 0 to 1")
@@ -417,14 +417,14 @@ def calibrate(
 
 
 def clock_of(field: FieldSightings, learned: Learned) -> ClockCheck | None:
-    """Return the common clock error from the sightings of all heliostats that fit."""
+    """Return the common clock error, estimated from all heliostats that fit their sightings."""
     rows = [misfit.row for misfit in learned.misfits]
     observed = field.sightings.take(~np.isin(field.sightings.heliostat, rows))
     return check_clock(learned.mechanism, observed, learned.model, field.plant.site)
 
 
 def _with_mechanism(plant: Plant, group: str, mechanism: Mechanism) -> Plant:
-    """Return the plant with these nominal mechanisms, including the ratios found, in a group."""
+    """Return the plant with new nominal mechanisms, including found ratios, in one group."""
     if mechanism is plant.groups[group].mechanism:
         return plant
     changed = replace(plant.groups[group], mechanism=mechanism)

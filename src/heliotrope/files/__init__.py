@@ -1,12 +1,12 @@
 """Safe reading and writing of files, with errors that name the file and the place in it.
 
 - `limits`: size, depth, count and expansion limits for all readers.
-- `kinds`: recognises files that another program, or another command, reads.
-- `text`: complete text and binary files; written completely or not at all.
+- `kinds`: recognises files that belong to another program or another command.
+- `text`: reads whole text and binary files, and writes files completely or not at all.
 - `json`, `xml`: documents whose values know their position in the file.
-- `documents`: TOML files of our own formats, checked against pydantic models. Its names stay there,
-  because pydantic is slow to load.
-- `disk`: work that waits for a disk, outside an event loop.
+- `documents`: TOML files of our own formats, checked against pydantic models. Its names must be
+  imported from there, because pydantic is slow to load.
+- `disk`: disk work, executed outside an event loop.
 - `archives`: ZIP members and NumPy arrays, whose size is checked before they are expanded.
 - `cells`: the only table reader (CSV in common spreadsheet variants, Parquet), cell by cell.
 - `times`: times in ISO 8601.

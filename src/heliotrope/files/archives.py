@@ -1,4 +1,4 @@
-"""Archives in ZIP format (.npz, .kmz), whose members are checked before they are expanded."""
+"""Read ZIP archives (.npz, .kmz), whose members are checked before they are expanded."""
 
 import io
 import math
@@ -32,17 +32,17 @@ def read_members(
     path
         The archive.
     what
-        Kind of file expected, as an error names it.
+        Expected kind of file, as named in errors.
     names
-        Members that it must contain; if none are named, all are read.
+        Members that the archive must contain; if none are named, all members are read.
     most
-        Largest size of all members once expanded, bytes.
+        Maximum total size of all members when expanded, bytes.
 
     Raises
     ------
     FormatError
-        As `check_file`; or if the file is not such an archive, lacks a member, or exceeds the
-        limits on members or expanded size.
+        As for `check_file`; or if the file is not an archive of the expected kind, lacks a member,
+        or exceeds the limits on members or expanded size.
     """
     file = check_file(path, what, binary=True)
     _check_contents(file, what)
@@ -74,7 +74,7 @@ def read_members(
 def _expanded(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
     """Return a member, expanded to no more than the size that its entry states."""
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        # Their decompressors cannot limit how much they return at once.
+        # The decompressors of these methods cannot limit how much they return at once.
         raise zipfile.BadZipFile(f"{entry.filename}: its compression is neither none nor deflate")
     with archive.open(entry) as stream:
         # `ZipFile.read` would expand everything before it truncates.
@@ -107,14 +107,14 @@ def read_arrays(
     path
         The file.
     what
-        Kind of file expected, as an error names it.
+        Expected kind of file, as named in errors.
     names
-        Arrays that it must contain; if none are named, all are read.
+        Arrays that the file must contain; if none are named, all arrays are read.
 
     Raises
     ------
     FormatError
-        As `read_members`, or if a member is not an array of numbers or texts.
+        As for `read_members`, or if a member is not an array of numbers or texts.
     """
     members = read_members(path, what, [f"{name}.npy" for name in names])
     arrays = {}

@@ -1,4 +1,4 @@
-"""Tables cell by cell: a row that cannot be used is left out and reported in one line."""
+"""Read tables cell by cell; a row that cannot be used is left out and reported in one line."""
 
 import csv
 import io
@@ -38,12 +38,12 @@ if TYPE_CHECKING:
 #: A column as it was read: texts, or the values from Parquet.
 Cells: TypeAlias = list[Any] | FloatArray
 
-#: Separators of cells, the likelier one first.
+#: Cell separators, the likelier one first.
 SEPARATORS = "\t;,|"
 _SEP_LINE = re.compile(r'"?sep=(.)"?[ ;,\t]*\n', re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?", re.ASCII)
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[,.' \u00a0\u202f]\d{3})+(?:[,.]\d*)?", re.ASCII)
-#: Maximum number of unknown names in a table for which close names are suggested.
+#: Similar names are suggested for at most this many unknown names in a table.
 _SUGGESTIONS = 20
 _TRUE, _FALSE = ("true", "t", "1", "1.0"), ("false", "f", "0", "0.0")
 
@@ -65,7 +65,7 @@ class Rows:
     heliostat
         Name of the heliostat in each row, for messages, (M,).
     reasons
-        Column ("" for the whole row) and reason why a row cannot be used, by its index.
+        For each unusable row, keyed by its index: the column ("" for the whole row) and the reason.
     """
 
     path: Path
@@ -144,17 +144,17 @@ class Rows:
                 )
 
     def refuse(self, i: "int | np.integer[Any]", column: str, reason: str) -> None:
-        """Leave out a row; only the first reason is kept."""
+        """Leave out a row; only the first reason for the row is kept."""
         self.reasons.setdefault(int(i), (column, reason))
 
     def texts(self, column: str) -> list[str]:
-        """Return the cells as texts, "" if empty or if there is no such column."""
+        """Return the cells as texts; "" if a cell is empty or there is no such column."""
         if column not in self.columns:
             return [""] * len(self)
         return ["" if _empty(cell) else str(cell) for cell in self.columns[column]]
 
     def filled(self, column: str) -> npt.NDArray[np.bool_]:
-        """Return the mask of the cells that are not empty, (M,)."""
+        """Return a mask of the cells that are not empty, (M,)."""
         return np.array([not _empty(cell) for cell in self.columns[column]], dtype=np.bool_)
 
     def numbers(self, column: str, what: str, empty: float | None = None) -> FloatArray:
@@ -165,7 +165,7 @@ class Rows:
         column
             Name of an existing column.
         what
-            Value to use instead, with its unit, for the message.
+            What to enter instead of an unusable cell, with its unit, for the message.
         empty
             Value for an empty cell; None rejects it.
         """
@@ -188,9 +188,9 @@ class Rows:
         self.check(column, outside, values, limits)
 
     def names(self, column: str, what: str) -> tuple[str, ...]:
-        """Return the names in a column; empty names, and duplicates, are rejected.
+        """Return the names in a column; empty and duplicate names are rejected.
 
-        Names that differ only in case, blanks or Unicode form are the same: see `alike`.
+        Names that differ only in case, blanks or Unicode form count as the same; see `alike`.
         """
         names = self.texts(column)
         first: dict[str, int] = {}
@@ -242,27 +242,28 @@ class Rows:
 def read_cells(
     path: Path, what: str, *, separators: str = SEPARATORS, record_end: str = ""
 ) -> tuple[list[str], list[list[str]]]:
-    """Return place ("line 12") and cells of each row of a text table; all tables are read here.
+    """Return the place ("line 12") and the cells of each row of a text table.
 
-    The text is UTF-8, UTF-16 with a byte-order mark, or Windows-1252, as written by spreadsheets.
-    Blanks around cells, and empty rows, are ignored.
+    All text tables are read by this function. The text is UTF-8, UTF-16 with a byte-order mark, or
+    Windows-1252, as written by spreadsheets. Blanks around cells, and empty rows, are ignored.
 
     Parameters
     ----------
     path
         The file.
     what
-        Kind of table, as an error names it.
+        Kind of table, as named in errors.
     separators
         Characters that may separate cells. A line ``sep=;`` before the table, as written by Excel,
         specifies another separator; otherwise the first row decides.
     record_end
-        A character that may end a row instead of a line end, if cells are separated by another one.
+        A character that may end a row instead of a line end, if cells are separated by a different
+        character.
 
     Raises
     ------
     FormatError
-        If it cannot be read, or exceeds the limits of `heliotrope.files.limits`.
+        If the file cannot be read, or exceeds the limits of `heliotrope.files.limits`.
     """
     text = unicodedata.normalize("NFC", read_text(path, what, spreadsheet=True))
     if other := instead(text[:4096].encode(), what, "table"):
@@ -305,19 +306,19 @@ def read_cells(
 
 
 def _separator(line: str, separators: str) -> str:
-    """Return the separator of a row, which may have decimal commas between semicolons."""
+    """Return the separator of a row, which may be a semicolon with decimal commas in between."""
     bare = re.sub(r'"[^"]*"', "", line)
     counts = {separator: bare.count(separator) for separator in separators}
     if counts.get(";") and all(piece.count(",") < 2 for piece in bare.split(";")):
         return ";"
-    # Blanks are separators only if nothing else is.
+    # Blanks are separators only if the row contains no other separator.
     blanks = counts.pop(" ", 0)
     best = max(counts, key=lambda separator: counts[separator])
     return best if counts[best] else " " if blanks else ","
 
 
 def read_rows(path: Path, what: str, known: Iterable[str] = ()) -> Rows:
-    """Return the rows of a table with a header; lines of another length are bad rows.
+    """Return the rows of a table with a header; lines with a different length are unusable.
 
     Parameters
     ----------
@@ -329,7 +330,7 @@ def read_rows(path: Path, what: str, known: Iterable[str] = ()) -> Rows:
     Raises
     ------
     FormatError
-        If it cannot be read, or its header is unusable.
+        If the file cannot be read, or its header is unusable.
     """
     places, table = read_cells(path, what)
     return rows_under(path, (places.pop(0), table.pop(0)), places, table, known)
@@ -342,7 +343,7 @@ def rows_under(
     table: list[list[str]],
     known: Iterable[str] = (),
 ) -> Rows:
-    """Return rows from the places and cells of a header and of the rows below it.
+    """Return rows from a header and from the places and cells of the rows below the header.
 
     Raises
     ------
@@ -359,7 +360,7 @@ def rows_under(
             raise FormatError(path, f"{problem}; name each column once", place)
         taken.add(name)
     rows = Rows(path, places, {}, place)
-    # Empty columns at the end are allowed; an extra cell in a single row has shifted all others.
+    # Empty columns at the end are allowed; an extra cell in a row means that its cells are shifted.
     widths = {len(cells) for cells in table}
     allowed = {len(names), len(header[1]), *(widths if len(widths) == 1 else ())}
     for i, cells in enumerate(table):
@@ -377,7 +378,7 @@ def read_parquet(path: Path, what: str) -> Rows:
     Raises
     ------
     FormatError
-        If it cannot be read, has nested columns, or exceeds the limits of
+        If the file cannot be read, has nested columns, or exceeds the limits of
         `heliotrope.files.limits`.
     """
     import pyarrow as pa
@@ -388,7 +389,7 @@ def read_parquet(path: Path, what: str) -> Rows:
         with pq.ParquetFile(path) as file:
             _check_parquet(path, file.metadata)
             texts = [field.name for field in file.schema_arrow if pa.types.is_string(field.type)]
-        # In a dictionary, a recurring text is in memory only once.
+        # With dictionary encoding, a recurring text is in memory only once.
         with pq.ParquetFile(path, read_dictionary=texts) as file:
             table = file.read()
         names = [_tidy(name) for name in table.column_names]
@@ -455,7 +456,7 @@ def find_heliostats(rows: Rows, column: str, names: Sequence[str]) -> npt.NDArra
     for i in np.flatnonzero(indices < 0):
         name = rows.heliostat[i]
         if name not in reasons:
-            # Close names are searched for among all names, which takes seconds for a table of
+            # Similar names are searched for among all names, which takes seconds for a table of
             # another field.
             reasons[name] = (
                 str(UnknownNameError("heliostat", name, names))
@@ -477,19 +478,19 @@ def _tidy(name: str) -> str:
 
 
 def _empty(cell: Any) -> bool:
-    # NaN and NaT, which Parquet may hold, are the values that differ from themselves.
+    # NaN and NaT, which Parquet may contain, differ from themselves.
     return cell is None or cell != cell or (isinstance(cell, str) and not cell.strip())  # noqa: PLR0124
 
 
 def check_names(what: str, names: Iterable[str]) -> None:
-    """Reject empty names, and names that count as the same.
+    """Reject empty names, and names that count as equal.
 
     Parameters
     ----------
     what
-        Kind of thing that bears the names, for the message.
+        Kind of object that has the names, for the message.
     names
-        Its names.
+        Names of the objects.
 
     Raises
     ------
@@ -497,7 +498,8 @@ def check_names(what: str, names: Iterable[str]) -> None:
         For the first such name.
     """
     listed = list(names)
-    # Checked all at once, because a field of 100,000 heliostats is checked each time it is copied.
+    # All names are checked at once, because a field of 100,000 heliostats is checked each time it
+    # is copied.
     text = unicodedata.normalize("NFKC", "\n".join(listed)).casefold()
     forms = re.sub(r"[^\S\n]+", "", text).split("\n") if listed else []
     if len(forms) == len(listed) == len(set(forms)) and all(forms):
@@ -536,7 +538,7 @@ def _number(cell: Any) -> float:
 
 
 def _hint(text: str) -> str:
-    """Return the remedy for a number in the notation of another country, or an empty text."""
+    """Return the remedy for a number in another country's notation; "" for any other text."""
     if _DECIMAL_COMMA.fullmatch(text):
         return "write a point, not a comma"
     if _THOUSANDS.fullmatch(text):

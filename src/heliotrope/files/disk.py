@@ -1,4 +1,4 @@
-"""Work that waits for a disk, done outside the loop that renews leases and sends emergencies.
+"""Disk work, done outside the event loop that renews leases and sends emergency orders.
 
 A `Disk` executes jobs in the order of their arrival, and reports their outcome to the event loop.
 `DiskThread` executes them in its own thread; `AtOnce` executes them immediately, as virtual time
@@ -29,22 +29,24 @@ class Disk(Protocol):
     """Executor of jobs that wait for a disk."""
 
     def do(self, work: Work, then: Then) -> None:
-        """Do work after all earlier work; call ``then`` in the loop with its error, or None.
+        """Do work after all earlier work, then call ``then`` in the event loop.
+
+        The argument of ``then`` is the error of the work, or None if the work succeeded.
 
         Raises
         ------
         DiskBusyError
-            If too much work waits already.
+            If too many jobs are already pending.
         """
         ...
 
     def close(self) -> None:
-        """Finish the pending work if the disk allows it soon, and end."""
+        """Finish the pending work, if the disk is fast enough, and stop."""
         ...
 
 
 class AtOnce:
-    """Does work immediately, in the caller."""
+    """Executor that does work immediately, in the calling thread."""
 
     def do(self, work: Work, then: Then) -> None:
         """Do work now; see `Disk.do`."""
@@ -77,7 +79,7 @@ class DiskThread:
 
         def run() -> None:
             error = _error_of(work)
-            with contextlib.suppress(RuntimeError):  # the loop has ended
+            with contextlib.suppress(RuntimeError):  # the event loop has ended
                 loop.call_soon_threadsafe(then, error)
 
         self._waiting.put(run)

@@ -1,4 +1,4 @@
-"""TOML files in our own formats, checked against pydantic models, with plain-language errors."""
+"""Read TOML files in our own formats, checked against pydantic models, with plain errors."""
 
 import tomllib
 from collections.abc import Iterable, Sequence
@@ -17,12 +17,12 @@ D = TypeVar("D", bound=BaseModel)
 
 
 def read_toml(path: str | Path, what: str) -> dict[str, Any]:
-    """Return the content of a TOML file; ``what`` names the expected kind of file in errors.
+    """Return the content of a TOML file; ``what`` is the kind of file that errors name.
 
     Raises
     ------
     FormatError
-        If it cannot be read, is not TOML, or exceeds the limits of `heliotrope.files.limits`.
+        If the file cannot be read, is not TOML, or exceeds the limits of `heliotrope.files.limits`.
     """
     text = read_text(path, what, TOML_SIZE)
     check_toml(path, text)
@@ -37,23 +37,23 @@ def read_toml(path: str | Path, what: str) -> dict[str, Any]:
 def read_document(
     path: str | Path, kind: str, model: type[D], tables: Iterable[type[BaseModel]]
 ) -> D:
-    """Return the document of a file that says ``format = "heliotrope-KIND"``.
+    """Return the document in a file that states ``format = "heliotrope-KIND"``.
 
     Parameters
     ----------
     path
         The file.
     kind
-        "plant", "cluster", …
+        Kind of document: "plant", "cluster", …
     model
         Model of the whole file.
     tables
-        Models whose keys are suggested for an unknown one.
+        Models whose keys are suggested for an unknown key.
 
     Raises
     ------
     FormatError
-        If something cannot be used; the text names file, place, value and limit.
+        If anything in the file cannot be used; the text names the file, place, value and limit.
     """
     raw = read_toml(path, f"a {kind} file")
     if raw.get("format") != f"heliotrope-{kind}":
@@ -73,9 +73,9 @@ def read_document(
 
 
 def _missing(errors: Sequence[Any]) -> tuple[str, tuple[Any, ...]]:
-    """Return one line on all keys that are missing in the table of the first error, and the table.
+    """Return one line about all keys missing in the table of the first error, and that table.
 
-    empty if the first error is of another kind.
+    The line is empty if the first error is of a different kind.
     """
     if errors[0]["type"] != "missing":
         return "", ()

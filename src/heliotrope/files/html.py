@@ -1,4 +1,4 @@
-"""Self-contained HTML pages: templates with escaping, one style, embedded pictures."""
+"""Create self-contained HTML pages: templates with escaping, one style, embedded pictures."""
 
 import base64
 import io
@@ -21,12 +21,12 @@ section { border-top: 1px solid #8886; margin-top: 2rem } :root { color-scheme: 
 
 
 def render(package: str, name: str, **values: object) -> "Markup":
-    """Return a template filled with values, which are escaped unless they are markup.
+    """Fill a template with values, which are escaped unless they are markup.
 
     Parameters
     ----------
     package
-        Package with the folder ``templates`` that holds the template.
+        Package with the folder ``templates`` that contains the template.
     name
         File name of the template.
     values
@@ -52,10 +52,10 @@ def _environment(package: str) -> "Environment":
 
 
 def as_written(figure: "Figure") -> None:
-    """Let a figure show its texts literally, so that a name with "$" is not taken for a formula.
+    """Make a figure show its texts literally, so that "$" in a name does not start a formula.
 
-    As a formula it may be unreadable, and abort the whole report. Only the powers of ten on
-    logarithmic axes are formulas.
+    A name taken for a formula may be unreadable, or abort the whole report. Only the powers of ten
+    on logarithmic axes are formulas.
     """
     from matplotlib.text import Text
 

@@ -1,4 +1,4 @@
-"""JSON files with errors that name the file and the place in it."""
+"""Read JSON files, with errors that name the file and the place in it."""
 
 import json
 import math
@@ -19,7 +19,7 @@ class JsonNode:
     path
         The file.
     value
-        Its value.
+        The value.
     where
         Path of keys that leads to the value, "" at the root.
     """
@@ -36,7 +36,7 @@ class JsonNode:
         return isinstance(self.value, dict) and key in self.value
 
     def __getitem__(self, key: str) -> "JsonNode":
-        """Return the value of a key, or fail with the keys that are there."""
+        """Return the value of a key; if it is missing, the error lists the existing keys."""
         if not isinstance(self.value, dict):
             raise self.fail(f"expected an object with {key!r}, found {self.value!r:.60}")
         if key not in self.value:
@@ -45,7 +45,7 @@ class JsonNode:
         return JsonNode(self.path, self.value[key], f"{self.where}.{key}" if self.where else key)
 
     def any_of(self, *keys: str) -> "JsonNode":
-        """Return the value of the first key that exists (formats have renamed keys)."""
+        """Return the value of the first key that exists, because formats have renamed keys."""
         for key in keys:
             if self.has(key):
                 return self[key]
@@ -103,8 +103,8 @@ def read_json(path: str | Path, what: str) -> JsonNode:
     Raises
     ------
     FormatError
-        If it is not a readable text file of a plausible size, is not JSON, or exceeds the limits of
-        `heliotrope.files.limits`.
+        If the file is not a readable text file of a plausible size, is not JSON, or exceeds the
+        limits of `heliotrope.files.limits`.
     """
     text = read_text(path, what)
     check_json(path, text)
@@ -115,5 +115,5 @@ def read_json(path: str | Path, what: str) -> JsonNode:
         other = instead(text[:4096].encode(), what, "JSON")
         raise FormatError(path, other or cut, "" if other else f"line {error.lineno}") from None
     except ValueError as error:
-        # An integer of thousands of digits.
+        # Raised for an integer of thousands of digits.
         raise FormatError(path, f"invalid JSON ({str(error)[:80]})") from None

@@ -1,9 +1,9 @@
-"""Recognises files by name and first bytes, and names the command that reads them."""
+"""Recognise files by name and first bytes, and name the command that reads them."""
 
 import re
 from pathlib import Path
 
-#: Files that nothing here reads: suffixes, first bytes, kind, and what to do.
+#: Files that no command reads: suffixes, first bytes, kind, and what to do.
 _FOREIGN: tuple[tuple[str, bytes, str, str], ...] = (
     (
         "",
@@ -33,7 +33,7 @@ _FOREIGN: tuple[tuple[str, bytes, str, str], ...] = (
     (".pdf", rb"%PDF-", "a PDF", "save its numbers as CSV"),
     (".mat", rb"MATLAB \d", "a MATLAB file", "save its numbers as CSV"),
 )
-#: Files that another command reads: first bytes, form, kind, and the command.
+#: Files that a different command reads: first bytes, form, kind, and the command.
 _OWN: tuple[tuple[bytes, str, str, str], ...] = (
     (
         rb"\s*(?:<\?xml.{0,300}?>\s*)?(?:<!--.{0,2000}?-->\s*)*<HelioK\b",
@@ -82,14 +82,14 @@ _OWN: tuple[tuple[bytes, str, str, str], ...] = (
 
 
 def foreign(path: Path, start: bytes) -> str:
-    """Return the kind of a file that no reader accepts, and the remedy; "" for any other.
+    """Return the kind and the remedy for a file that no reader accepts; "" for other files.
 
     Parameters
     ----------
     path
         The file.
     start
-        Its first 4 kB.
+        The first 4 kB of the file.
     """
     bare = start.removeprefix(b"\xef\xbb\xbf")
     for suffixes, mark, kind, advice in _FOREIGN:
@@ -100,16 +100,16 @@ def foreign(path: Path, start: bytes) -> str:
 
 
 def instead(start: bytes, what: str, own: str = "") -> str:
-    """Return the kind of a file that is not ``what``, and the command that reads it; or "".
+    """Return the kind of a file that is not ``what``, and the command for it; "" if unknown.
 
     Parameters
     ----------
     start
-        Its first bytes.
+        The first bytes of the file.
     what
         Kind of file expected, as an error names it.
     own
-        The form that ``what`` has: "JSON", "XML", "TOML", "table".
+        The form of ``what``: "JSON", "XML", "TOML" or "table".
     """
     bare = start.removeprefix(b"\xef\xbb\xbf")
     for mark, form, kind, advice in _OWN:

@@ -1,8 +1,8 @@
-"""Limits for files from any origin, and the checks that need no parser.
+"""Limits for files from any origin, and checks that do not need a parser.
 
 Every reader checks size, count, depth and expansion before it uses memory for a file. Within these
-limits no reader takes more than 1.5 GB or a minute; for a file beyond a limit one line states the
-file, the value, the limit and what to do.
+limits no reader takes more than 1.5 GB or a minute. If a file exceeds a limit, a one-line error
+states the file, the value, the limit and what to do.
 """
 
 import os
@@ -15,14 +15,14 @@ from heliotrope.errors import FormatError
 from heliotrope.files.kinds import foreign, instead
 
 MIB = 2**20
-#: Largest file that is read, bytes: a layout of 400,000 heliostats is 60 MB.
+#: Largest file that is read, bytes; a layout of 400,000 heliostats has 60 MB.
 SIZE_LIMIT = 64 * MIB
 #: Largest TOML file, bytes; its parser takes 200 bytes of memory for each byte.
 TOML_SIZE = 2 * MIB
 #: Maximum nesting depth of an XML, JSON or TOML document.
 DEPTH = 64
-#: Maximum number of parts in a dotted TOML key; the parser's time and memory grow with their
-#: square.
+#: Maximum number of parts in a dotted TOML key; the parser's time and memory grow with the square
+#: of this number.
 DOTTED_PARTS = 16
 #: Maximum number of elements and attributes in an XML document.
 XML_PARTS = 3_000_000
@@ -32,7 +32,7 @@ XML_TAG = MIB
 JSON_VALUES = 2_000_000
 #: Maximum numbers of rows, columns and cells in a CSV table.
 ROWS, COLUMNS, CELLS = 1_000_000, 1_000, 10_000_000
-#: Largest Parquet file and its largest expanded size, bytes, and the maximum number of cells.
+#: Maximum size of a Parquet file, maximum size once expanded, bytes, and maximum number of cells.
 PARQUET_SIZE, PARQUET_EXPANDED, PARQUET_CELLS = 256 * MIB, 512 * MIB, 50_000_000
 #: Largest expanded size of an archive's members (.npz, .kmz), bytes, and maximum number of members.
 EXPANDED, MEMBERS = 256 * MIB, 256
@@ -64,7 +64,7 @@ def check_file(
     path
         The file.
     what
-        Expected kind of file, as an error names it ("a HelioK file").
+        Expected kind of file, as named in errors ("a HelioK file").
     binary
         Whether to accept files that do not begin like text.
     limit
@@ -73,12 +73,12 @@ def check_file(
     Raises
     ------
     FormatError
-        If it does not exist, is a folder, a device or a pipe, cannot be read, is empty, belongs to
-        another program, exceeds the size limit or does not begin like text.
+        If the file does not exist, is a folder, a device or a pipe, cannot be read, is empty,
+        belongs to another program, exceeds the size limit or does not begin like text.
     """
     file = Path(path)
     try:
-        # A pipe without a writer would never open.
+        # Opening a pipe without a writer would block for ever.
         handle = os.open(file, os.O_RDONLY | os.O_NONBLOCK)
         with os.fdopen(handle, "rb") as stream:
             state = os.fstat(handle)
@@ -114,14 +114,14 @@ def _mib(size: int) -> str:
 def check_count(
     path: str | Path, count: int, limit: int, name: str, advice: str, where: str = ""
 ) -> None:
-    """Raise FormatError if a file has more of something than the limit.
+    """Raise FormatError if a file has more items of some kind than the limit.
 
     Parameters
     ----------
     path
         The file.
     count, limit
-        Number that it has, and the largest accepted.
+        Number of items in the file, and maximum number accepted.
     name
         Name of what is counted, in the plural.
     advice
@@ -139,7 +139,7 @@ def check_json(path: str | Path, text: str) -> None:
     Raises
     ------
     FormatError
-        If it has more values or levels than the limits.
+        If the document has more values or levels than the limits.
     """
     brackets = text.count("[") + text.count("{")
     check_count(path, text.count(",") + brackets, JSON_VALUES, "values", "divide the file")
@@ -153,7 +153,7 @@ def check_toml(path: str | Path, text: str) -> None:
     Raises
     ------
     FormatError
-        If it has more levels, or a key has more parts, than the limits.
+        If the document has more levels, or a key has more parts, than the limits.
     """
     if text.count("[") + text.count("{") > DEPTH:
         _check_depth(path, text, _TOML_TOKEN.finditer(text))
@@ -185,7 +185,7 @@ def _line(text: str, place: int) -> str:
 
 
 def check_entries(folder: Path, entries: Iterable[Path]) -> Iterable[Path]:
-    """Yield the entries of a folder; raise FormatError at the first beyond the limit."""
+    """Yield the entries of a folder; raise FormatError if there are more than the limit."""
     for number, entry in enumerate(entries, 1):
         check_count(folder, number, ENTRIES, "files", "divide the folder")
         yield entry

@@ -1,4 +1,4 @@
-"""Complete files, read with one-line errors and written completely or not at all."""
+"""Read whole files with one-line errors, and write files completely or not at all."""
 
 import errno
 import os
@@ -10,7 +10,7 @@ from typing import BinaryIO
 from heliotrope.errors import FormatError, InputError
 from heliotrope.files.limits import SIZE_LIMIT, check_count, check_file
 
-#: A character of several bytes in UTF-8, and bytes that occur in no text.
+#: Patterns of a UTF-8 character with several bytes, and of bytes that occur in no text.
 _UTF_8 = re.compile(rb"[\xc2-\xdf][\x80-\xbf]|[\xe0-\xef][\x80-\xbf]{2}|[\xf0-\xf4][\x80-\xbf]{3}")
 _CONTROLS = re.compile(rb"[\x00-\x08\x0e-\x1f\x7f]")
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -32,7 +32,7 @@ def read_text(
     Raises
     ------
     FormatError
-        As for `check_file`, or if it is in none of these encodings.
+        As for `check_file`, or if the text is in none of these encodings.
     """
     file = check_file(path, what, limit=limit)
     content = read_bytes(file, limit)
@@ -53,21 +53,21 @@ def _decoded(content: bytes, spreadsheet: bool) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        # A file that is UTF-8 except for some bytes is damaged.
+        # A file that is UTF-8 except for a few bytes is damaged.
         if not spreadsheet or _UTF_8.search(content) or _CONTROLS.search(content):
             raise
     return content.decode("cp1252")
 
 
 def read_bytes(path: str | Path, limit: int = SIZE_LIMIT) -> bytes:
-    """Return the content of a file that does not exceed ``limit`` bytes, even while it is read.
+    """Return the content of a file of at most ``limit`` bytes, even if it grows meanwhile.
 
     Raises
     ------
     FormatError
-        If it exceeds the limit.
+        If the file exceeds the limit.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
     """
     with Path(path).open("rb") as stream:
         content = stream.read(limit + 1)

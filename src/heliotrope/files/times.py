@@ -1,4 +1,4 @@
-"""Times in ISO 8601: conversion of texts to times, and back."""
+"""Convert ISO 8601 texts to times, and back."""
 
 import math
 import re
@@ -16,7 +16,7 @@ _SECOND_60 = re.compile(r"(.*[T ]\d\d:?\d\d:?)60(.*)", re.ASCII | re.DOTALL)
 
 
 def moment(text: str) -> datetime:
-    """Return the time in an ISO 8601 text, without a zone if the text has none.
+    """Return the time in an ISO 8601 text, without a time zone if the text has none.
 
     A leap second (23:59:60 UTC on the last day of a month) is treated as the following second, as
     in Unix time.
@@ -24,7 +24,7 @@ def moment(text: str) -> datetime:
     Raises
     ------
     ValueError
-        If it is not a time.
+        If the text is not a time.
     """
     match = _SECOND_60.fullmatch(text.strip())
     if match is None:
@@ -37,12 +37,12 @@ def moment(text: str) -> datetime:
 
 
 def parse_time(text: str) -> float:
-    """Return the Unix seconds of an ISO 8601 text, the nearest double to all its digits.
+    """Return the Unix seconds of an ISO 8601 text, as the double nearest to all its digits.
 
     Raises
     ------
     InputError
-        If it is not a time, or has no time zone.
+        If the text is not a time, or has no time zone.
     """
     match = _TIME.fullmatch(text.strip())
     if match is None:
@@ -67,7 +67,7 @@ def format_time(seconds: float) -> str:
     Raises
     ------
     InputError
-        If they are infinite or outside the years 1 to 9999.
+        If the seconds are infinite or outside the years 1 to 9999.
     """
     if math.isnan(seconds):
         return ""
@@ -79,6 +79,6 @@ def format_time(seconds: float) -> str:
     # repr is the shortest text that yields the same double; its decimals are kept exactly.
     decimals = f"{Decimal(repr(float(seconds))):f}".partition(".")[2].rstrip("0")
     if decimals and seconds < 0.0:
-        # Below the epoch the time of day still counts upwards.
+        # Before the epoch the time of day still counts upwards.
         decimals = f"{10 ** len(decimals) - int(decimals):0{len(decimals)}d}"
     return f"{stamp}.{decimals}Z" if decimals else f"{stamp}Z"

@@ -36,11 +36,11 @@ class XmlElement:
     line: int = field(default=0, compare=False)
 
     def get(self, name: str) -> str | None:
-        """Return the value of an attribute, or None if it does not exist."""
+        """Return the value of an attribute; None if the attribute does not exist."""
         return dict(self.attributes).get(name)
 
     def elements(self, *tags: str) -> Iterator["XmlElement"]:
-        """Yield the child elements, only those with one of ``tags`` if any are given."""
+        """Yield the child elements; if ``tags`` are passed, only those with one of these tags."""
         return (child for child in self.children if not tags or child.tag in tags)
 
 
@@ -53,7 +53,7 @@ class Document:
     root
         The outermost element.
     path
-        File it was read from; ignored in comparisons.
+        File from which the document was read; ignored in comparisons.
     """
 
     root: XmlElement
@@ -68,7 +68,7 @@ def read_xml(path: str | Path, what: str) -> Document:
     path
         The file.
     what
-        Expected kind of file, as an error names it.
+        Expected kind of file, as named in errors.
 
     Raises
     ------
@@ -99,13 +99,13 @@ def read_xml(path: str | Path, what: str) -> Document:
 
 
 class _Builder:
-    """The tree of a document, built and checked against the limits during parsing."""
+    """Builder of a document tree, which checks the limits during parsing."""
 
     def __init__(self, file: Path) -> None:
         self.root = XmlElement("")
         self.parser = expat.ParserCreate(namespace_separator="}")
         self.parser.ordered_attributes = True
-        # Nothing is expanded or fetched, because a file may come from anywhere.
+        # No entity is expanded and nothing is fetched, because a file may come from anywhere.
         self.parser.StartDoctypeDeclHandler = self._refuse_type
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end

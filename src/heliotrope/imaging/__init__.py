@@ -1,14 +1,14 @@
-"""Photographs of targets: from a frame to spots in metres with covariance, and to sightings.
+"""Photographs of targets: from a frame to spots, in metres with covariance, and to sightings.
 
 - `frame`, `files`, `sources`: frames, image files, and frame sources.
-- `targets`: find targets by their marks; teach a camera its targets.
+- `targets`: find targets by their marks; set up reference views of targets for a camera.
 - `spots`: background, spots and their quality.
-- `photograph`: evaluate one photograph; `campaign`: turn many into sightings; `memory`: models of
-  empty targets; `log`: facts about photographs; `annotate`: draw the result.
+- `photograph`: evaluate one photograph; `campaign`: turn many photographs into sightings; `memory`:
+  models of empty targets; `log`: facts about photographs; `annotate`: draw the result.
 - `lens`: calibrate lenses; `pose`: locate cameras. The camera model is `heliotrope.field.camera`.
 - `coded`: several beams on one target at once, identified by coded movements.
-- `motion`: whether a beam moved between two frames.
-- `synthetic`: rendered frames with exact ground truth; simulations import this package themselves.
+- `motion`: detect whether a beam moved between two frames.
+- `synthetic`: render frames with exact ground truth; only simulations import this package.
 
 Begin with `read_image` and `read_photograph`.
 """

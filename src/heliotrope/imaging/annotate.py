@@ -1,4 +1,4 @@
-"""Annotates a photograph with its evaluation."""
+"""Annotate a photograph with its evaluation."""
 
 import numpy as np
 
@@ -16,13 +16,13 @@ _NINETY = 2.146
 
 
 def annotate(photograph: Photograph) -> Image:
-    """Return the photograph with marks, outlines, spots, centroids and notes drawn into it.
+    """Return the photograph with marks, outlines, spots, centroids and notes drawn on it.
 
     Returns
     -------
-    Blue, green, red, (H, W, 3) of uint8; larger photographs are scaled down. A spot is drawn as the
-    outline of its pixels, its centroid, the one-sigma ellipse of its light and, filled, the 90 %
-    ellipse of the centroid error.
+    The picture as blue, green, red, (H, W, 3), uint8; large photographs are scaled down. A spot is
+    drawn as the outline of its pixels, its centroid, the one-sigma ellipse of its light and,
+    filled, the 90 % ellipse of the centroid error.
     """
     sheet = _Sheet(photograph)
     for face in photograph.faces:
@@ -47,7 +47,7 @@ class _Sheet:
         frame = photograph.frame
         pixels = frame.pixels
         if pixels.dtype != np.uint8:
-            # 12 bits in 16 are common: scale to the brightest pixel.
+            # 12-bit values in 16 bits are common, so scale to the brightest pixel.
             top = max(int(pixels.max()), 1)
             pixels = (pixels.astype(np.float32) * (255.0 / top)).astype(np.uint8)
         if pixels.ndim == 2:
@@ -135,7 +135,7 @@ class _Sheet:
 
         lines = []
         present = [r for r in photograph.readings if r.found.found]
-        # A camera sees few of a plant's targets, so absent targets matter only if all are absent.
+        # A camera sees few of a plant's targets, so missing targets matter only if all are missing.
         for reading in present or photograph.readings:
             colour = GOOD if reading.good else BAD
             lines += [(line, colour) for line in _said(reading)]
@@ -152,7 +152,7 @@ class _Sheet:
         strip = np.full((pitch * len(wrapped) + 10, width, 3), 20, dtype=np.uint8)
         for k, (text, colour) in enumerate(wrapped):
             where = (6, pitch * (k + 1) - 4)
-            # OpenCV's font has no letters beyond ASCII.
+            # OpenCV's font contains only ASCII characters.
             plain = text.encode("ascii", "replace").decode()
             light = tuple(min(255, c + 70) for c in colour)
             cv2.putText(strip, plain, where, cv2.FONT_HERSHEY_SIMPLEX, scale, light, 1, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""Evaluates many photographs, in parallel or one by one, and turns them into sightings."""
+"""Evaluate many photographs, in parallel or one by one, and turn them into sightings."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
@@ -42,12 +42,12 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 Origin = tuple[float, float, float]
 
-#: With fewer photographs, a further process costs more than it gains.
+#: With fewer photographs per process, another process costs more time than it saves.
 FEWEST_FOR_PROCESSES = 8
 #: Maximum angular speed of the sun, rad/s.
 _SUN_RATE = 7.292e-5
-#: Standard deviation of a beam caused by atmosphere and heliostat, rad. A single photograph cannot
-#: show it, but repeated sightings do.
+#: Standard deviation of a beam due to atmosphere and heliostat, rad. A single photograph cannot
+#: reveal it, but repeated sightings do.
 BEAM_SIGMA = 1e-4
 
 
@@ -66,11 +66,11 @@ class Job:
     settings
         Evaluation settings.
     crop
-        Whether each picture shows exactly one target: that of its log entry, or ``target``.
+        Whether each picture shows exactly one target, which is that of its log entry or ``target``.
     target
-        Target whose reading counts if the log names no target; "" accepts any valid reading.
+        Target whose reading is used if the log names no target; "" accepts any valid reading.
     annotated
-        Folder for annotated pictures, or None.
+        Folder for annotated pictures; None for no such pictures.
     without
         A frame from the camera without beams.
     """
@@ -86,7 +86,7 @@ class Job:
 
     @property
     def trust(self) -> str:
-        """Warn, in one line, if frames cannot show whether they are mirrored; else empty."""
+        """One-line warning if frames cannot show whether they are mirrored; otherwise empty."""
         if self.crop:
             cause = "a crop shows one target without its surroundings"
         elif self.camera is not None and self.camera.position is not None:
@@ -111,14 +111,14 @@ class Outcome:
     path
         The file.
     document
-        Everything found, ready for JSON; empty if the file could not be read.
+        Everything found, as a JSON object; empty if the file could not be read.
     problem
-        Why the file could not be read; empty if it was.
+        Why the file could not be read; an empty string if it was read.
     point, covariance
-        Position of the spot that counts and its covariance, ENU, (3,) and (3, 3); None if no spot
-        can be trusted.
+        Position of the accepted spot, and its covariance, ENU, (3,) and (3, 3); None if no spot can
+        be trusted.
     target
-        Target of that spot.
+        Target of the accepted spot.
     refusal
         Why no spot can be trusted.
     time, time_deviation
@@ -126,7 +126,7 @@ class Outcome:
     annotated
         The annotated picture, if one was written.
     views
-        How the faces lie in the frame, as a start for the next frame.
+        How the faces lie in the frame, as a starting point for the next frame.
     faces
         The faces found, from which models of empty targets are updated.
     """
@@ -146,7 +146,7 @@ class Outcome:
 
 
 def process(path: Path, job: Job, entry: Entry | None = None) -> Outcome:
-    """Read one file; a problem with it is returned, not raised.
+    """Evaluate one file. A problem with the file is returned rather than raised.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def process(path: Path, job: Job, entry: Entry | None = None) -> Outcome:
     job
         How to evaluate it.
     entry
-        Its entry in the log, in particular its target.
+        Log entry of the photograph, in particular its target.
     """
     try:
         frame = read_image(path)
@@ -173,7 +173,7 @@ def look(
     entry: Entry | None = None,
     previous: Sequence[FaceView] = (),
 ) -> Outcome:
-    """Read one frame.
+    """Evaluate one frame.
 
     Parameters
     ----------
@@ -182,14 +182,14 @@ def look(
     job
         How to evaluate it.
     entry
-        Its entry in the log.
+        Log entry of the photograph.
     previous
-        Views of an earlier frame of the same camera.
+        Views from an earlier frame by the same camera.
 
     Raises
     ------
     InputError
-        If its target is needed but unknown, if two targets are named, or if the annotated picture
+        If the target is needed but unknown, if two targets are named, or if the annotated picture
         cannot be written.
     """
     recorded = "" if entry is None else entry.target
@@ -246,14 +246,14 @@ def _target(job: Job, name: str, path: Path) -> Target:
 
 
 def meant(photograph: Photograph, target: str) -> tuple[TargetReading | None, str]:
-    """Return the reading that counts, and the reasons not to trust it (empty: it is good).
+    """Return the reading to use, and the reasons not to trust it (empty if it is good).
 
     Parameters
     ----------
     photograph
         The photograph, already read.
     target
-        Target that the beam was sent to; if empty, exactly one must have a spot.
+        Target to which the beam was sent; if empty, exactly one target must have a spot.
     """
     if target:
         reading = photograph.reading(target)
@@ -279,7 +279,7 @@ def _why(reading: TargetReading) -> str:
 
 
 def document(photograph: Photograph, origin: Origin, annotated: Path | None) -> dict[str, Any]:
-    """Return everything found in a photograph, ready for JSON, with units in the names."""
+    """Return everything found in a photograph as a JSON object, with units in the names."""
     frame = photograph.frame
     return {
         "file": frame.name,
@@ -418,9 +418,9 @@ def entries_of(paths: Sequence[Path], log: Log | None, heliostat: str = "") -> l
     paths
         Photographs.
     log
-        Searched first.
+        The log, which is searched first.
     heliostat
-        Heliostat whose beams the photographs show, if nothing else specifies it.
+        Heliostat whose beams the photographs show, if no entry specifies the heliostat.
 
     Raises
     ------
@@ -446,7 +446,7 @@ def to_sightings(
     mechanism: Mechanism | None = None,
     now: float | None = None,
 ) -> tuple[Sightings | None, list[str]]:
-    """Return the plausible sightings from photographs, and a message for each one left out.
+    """Return the plausible sightings from photographs, and a message for each photograph left out.
 
     Parameters
     ----------
@@ -455,16 +455,16 @@ def to_sightings(
     names
         Names of the heliostats, in the plant's order.
     site
-        Site for the sun's direction, where the log does not specify it.
+        Site, used to compute the sun's direction where the log does not specify it.
     sigma
         Standard deviation of a beam excluding that of its centroid, rad.
     mechanism, now
-        Mechanisms of the named heliostats, and the computer's clock, to detect impossible
-        sightings: see `heliotrope.calibration.plausibility.judge`.
+        Mechanisms of the named heliostats, and the time by the computer's clock, used to detect
+        impossible sightings; see `heliotrope.calibration.plausibility.judge`.
 
     Returns
     -------
-    The sightings are None if no photograph yields one.
+    The sightings, which are None if no photograph yields a sighting, and the messages.
     """
     rows: list[tuple[int, FloatArray, FloatArray, Outcome, float, float]] = []
     left_out: list[str] = []
@@ -523,7 +523,7 @@ def sighting_of(
     time
         See `heliotrope.sun.Times`; by default the time of the frame.
     sun
-        Direction to the apparent sun, ENU, (3,); by default that at the time of the frame.
+        Direction to the apparent sun, ENU, (3,); default: computed for the time of the frame.
     sigma
         Standard deviation of a beam excluding that of its centroid, rad.
 
@@ -575,7 +575,7 @@ def _unusable(outcome: Outcome, entry: Entry | None, index: Mapping[str, int]) -
 
 
 def _sun(outcome: Outcome, entry: Entry, site: Site) -> tuple[FloatArray | None, float, float, str]:
-    """Return direction, Unix seconds and variance (rad²) of the sun, and the problem if any."""
+    """Return the sun's direction, the Unix time, s, the variance, rad², and any problem."""
     time = entry.time or outcome.time
     seconds = float("nan") if time is None else time.astimezone(UTC).timestamp()
     if entry.sun is not None:

@@ -1,7 +1,7 @@
-"""Image files: read completely or rejected in one line, dated, and written all or nothing.
+"""Image files: each is read completely or rejected, dated, and written completely or not at all.
 
-Pillow opens every file, checks that it is complete and decodes it. Pillow has no 16-bit colour, so
-OpenCV decodes such files once Pillow has checked them.
+Pillow opens every file, checks that it is complete and decodes it. Pillow does not support 16-bit
+colour, so OpenCV decodes such files once Pillow has checked them.
 
 The orientation stored in a file (EXIF, TIFF) is *not* applied, because a camera's calibration
 refers to the rows and columns of its sensor, however the camera was held. Alpha is dropped; a file
@@ -40,9 +40,9 @@ from heliotrope.files.limits import PIXELS, check_entries
 from heliotrope.files.text import read_bytes, write_file
 from heliotrope.imaging.frame import Frame, Pixels
 
-#: Suffixes that `find_images` looks for; `read_image` goes by the content instead.
+#: Suffixes that `find_images` accepts; `read_image` relies on the content instead.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-#: Suffixes of pictures that `read_image` refuses; such files in a folder are reported by name.
+#: Suffixes of pictures that `read_image` rejects; such files in a folder are reported by name.
 OTHER_SUFFIXES = (".gif", ".heic", ".heif", ".avif", ".jp2", ".fits")
 #: Default limit of `read_image`, pixels.
 LIMIT = PIXELS
@@ -50,7 +50,7 @@ LIMIT = PIXELS
 SMALLEST = 16
 
 _KINDS = "PNG, JPEG, TIFF, BMP or WebP"
-# The openers themselves, not Image.open, whose pixel limit applies to the whole process.
+# Use the openers directly, because the pixel limit of Image.open applies to the whole process.
 _OPENERS: dict[bytes, tuple[str, Callable[[io.BytesIO], ImageFile.ImageFile]]] = {
     b"\x89PNG\r\n\x1a\n": ("PNG", PngImagePlugin.PngImageFile),
     b"\xff\xd8\xff": ("JPEG", JpegImagePlugin.jpeg_factory),
@@ -70,7 +70,7 @@ _OTHERS = {
     b"II+\0": "a BigTIFF",
     b"MM\0+": "a BigTIFF",
 }
-#: What Pillow raises for damaged files; it also issues warnings about some damage.
+#: Exceptions that Pillow raises for damaged files; it also issues warnings about some damage.
 _FAULTS = (
     SyntaxError,
     OSError,
@@ -86,12 +86,12 @@ _FAULTS = (
     UserWarning,
     Image.DecompressionBombError,
 )
-_ROUNDING = 1.0 / math.sqrt(12.0)  # standard deviation of a value rounded to whole units
+_ROUNDING = 1.0 / math.sqrt(12.0)  # Standard deviation of a value rounded to whole units.
 
 
 @dataclass(frozen=True)
 class _Container:
-    """A file opened by Pillow; ``texts`` and ``changed`` are text and time chunks of a PNG."""
+    """A file opened by Pillow; ``texts`` and ``changed`` are the text and time chunks of a PNG."""
 
     kind: str
     image: ImageFile.ImageFile
@@ -107,37 +107,37 @@ class _Container:
 def read_image(
     path: str | Path, *, limit: int = LIMIT, zone: tzinfo | None = None, mtime: bool = False
 ) -> Frame:
-    """Return the image in a file, and when it was taken if the file says so.
+    """Return the image in a file, with the time at which it was taken if the file states it.
 
     Parameters
     ----------
     path
         A PNG, JPEG, TIFF (8 or 16 bit), BMP or WebP; its suffix does not matter.
     limit
-        Maximum number of pixels; checked in the header, before anything is decoded.
+        Maximum number of pixels, checked in the header before anything is decoded.
     zone
-        Time zone for times in EXIF and in file names that have none; without it such times are
+        Time zone of times in EXIF and in file names that state none. By default such times are
         ignored.
     mtime
-        Whether to fall back on the file's modification time; its standard deviation is unknown
+        Whether to fall back on the file's modification time, whose standard deviation is unknown
         (NaN).
 
     Returns
     -------
     Frame
-        uint8, or uint16 if the file has 16 bits; grey (H, W) or blue-green-red (H, W, 3). Its time
-        is the first of these that is present: EXIF DateTimeOriginal with its offset; PNG's
-        "Creation Time"; a time in the file name (2023-05-13T15-53-57Z, 20230513_155357Z); PNG's
-        tIME, which by definition is the time of the last change; otherwise None. A time is taken as
-        rounded to its last digit, so whole seconds have a standard deviation of 1/√12 s. Exposure
-        and gain (ISO/100) come from EXIF.
+        uint8, or uint16 if the file has 16 bits; grey (H, W) or blue-green-red (H, W, 3). The time
+        of the frame is the first of these that is present: EXIF DateTimeOriginal with its offset;
+        PNG's "Creation Time"; a time in the file name (2023-05-13T15-53-57Z, 20230513_155357Z);
+        PNG's tIME, which by definition is the time of the last change; otherwise None. A time is
+        assumed to be rounded to its last digit, so whole seconds have a standard deviation of 1/√12
+        s. Exposure and gain (ISO/100) come from EXIF.
 
     Raises
     ------
     FormatError
         If there is no such image; if it is damaged, truncated, too large, too small or transparent
-        everywhere; or if it cannot be kept unchanged, as with CMYK, float, several pages or
-        animation.
+        everywhere; or if it cannot be represented unchanged, as with CMYK, floating-point values,
+        several pages or animation.
     """
     file = Path(path)
     data, changed = _content(file, limit)
@@ -205,8 +205,8 @@ def _natural(path: Path) -> tuple[list[tuple[int, str, int]], str]:
 
 
 def _content(file: Path, limit: int) -> tuple[bytes, float]:
-    """Return the bytes of a file, if its size is plausible, and its modification time."""
-    most = 8 * limit + 2**24  # four channels of 16 bit, and room for metadata
+    """Return the bytes and the modification time of a file, if its size is plausible."""
+    most = 8 * limit + 2**24  # Four channels of 16 bits, and room for metadata.
     try:
         state = file.stat()
         if stat.S_ISDIR(state.st_mode):
@@ -312,13 +312,13 @@ def _png(image: ImageFile.ImageFile, data: bytes) -> _Container:
             with suppress(ValueError, struct.error):
                 y, mo, d, h, mi, sec = struct.unpack(">HBBBBB", body)
                 changed = datetime(y, mo, d, h, mi, sec, tzinfo=UTC)
-    # verify() leaves the image unusable.
+    # After verify() the image is unusable, so open it again.
     again = PngImagePlugin.PngImageFile(io.BytesIO(data))
     return _Container("PNG", again, data, exif, texts, changed)
 
 
 def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes, bytes]]:
-    """Yield each chunk of a PNG: its type, its content, and all of its bytes."""
+    """Yield the type, the content and all the bytes of each chunk of a PNG."""
     position = 8
     while position + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, position)
@@ -360,7 +360,7 @@ def _check_tiff(file: Path, image: TiffImagePlugin.TiffImageFile, data: bytes) -
 
 
 def _further_pages(data: bytes) -> Iterator[int]:
-    """Yield NewSubfileType of each page after the first; bit 0 marks a smaller version."""
+    """Yield the NewSubfileType of each page after the first; bit 0 marks a reduced version."""
     stream, directory = io.BytesIO(data), TiffImagePlugin.ImageFileDirectory_v2(data[:8])
     visited: set[int] = set()
     while directory.next and directory.next not in visited:
@@ -399,7 +399,7 @@ def _decode(file: Path, container: _Container) -> Pixels:
 
 
 def _is_transparent(image: ImageFile.ImageFile) -> bool:
-    """Return whether alpha is 0 everywhere; a file that cannot be decoded is refused later."""
+    """Return whether alpha is 0 everywhere; a file that cannot be decoded is rejected later."""
     if image.mode not in ("RGBA", "LA", "PA"):
         return False
     with suppress(*_FAULTS):
@@ -421,7 +421,7 @@ def _is_deep_colour(container: _Container) -> bool:
 
 
 def _eight_bit(image: ImageFile.ImageFile) -> Pixels:
-    """Return the pixels decoded by Pillow: 8 bits, or 16-bit grey."""
+    """Return the pixels decoded by Pillow, with 8 bits or as 16-bit grey."""
     import cv2
 
     image.load()
@@ -442,8 +442,8 @@ def _deep_colour(file: Path, container: _Container) -> Pixels:
 
     data = container.data
     if container.kind == "PNG":
-        # libpng writes complaints about profiles and texts to standard error, so it gets none. Bit
-        # 5 of the first letter marks a chunk that is not needed for decoding.
+        # libpng writes complaints about profiles and texts to standard error, so these chunks are
+        # removed. Bit 5 of the first letter marks a chunk that is not needed for decoding.
         data = data[:8] + b"".join(w for kind, _, w in _chunks(data) if not kind[0] & 0x20)
     how = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), how)
@@ -469,17 +469,17 @@ def _turned_back(pixels: Pixels, orientation: int) -> Pixels:
 def _is_torn(pixels: Pixels, data: bytes) -> bool:
     """Return whether the scan of a JPEG ends before its picture does.
 
-    libjpeg then fills the rest with one value, and its warning does not reach Pillow's callers. A
-    scene that really has one value throughout, as at night, codes every block with the same bits,
-    so its scan ends in repeating bits. With restart markers (DRI) or progressive scans (SOF2) this
-    does not hold, so they are not checked.
+    libjpeg then fills the rest with one value, and its warning does not reach Pillow's callers. If
+    a scene really has one value throughout, as at night, every block is coded with the same bits,
+    so the scan ends in repeating bits. This is not true with restart markers (DRI) or progressive
+    scans (SOF2), so such files are not checked.
     """
     last = pixels[-8:, -128:]
     header = data[: data.find(b"\xff\xda")]
     if (last != last[0, 0]).any() or b"\xff\xdd" in header or b"\xff\xc2" in header:
         return False
     scan = data[: data.rfind(b"\xff\xd9")][-1024:].replace(b"\xff\0", b"\xff")
-    bits = np.unpackbits(np.frombuffer(scan[:-1], np.uint8))  # the last byte holds fill bits
+    bits = np.unpackbits(np.frombuffer(scan[:-1], np.uint8))  # The last byte holds fill bits.
     return not any(np.array_equal(bits[-4 * n : -n], bits[-3 * n :]) for n in range(4, 512))
 
 
@@ -504,7 +504,7 @@ def _time(file: Path, container: _Container, zone: tzinfo | None) -> tuple[datet
 
 
 def _exif(get: Callable[[], Image.Exif]) -> Mapping[int, Any]:
-    """Return the EXIF tags together with those of the image; none if they are damaged."""
+    """Return the EXIF tags together with the image tags; an empty mapping if damaged."""
     try:
         exif = get()
         return dict(exif) | exif.get_ifd(0x8769)
@@ -542,7 +542,7 @@ def _name_time(name: str, zone: tzinfo | None) -> tuple[datetime | None, float]:
 def _stated(
     numbers: tuple[str, ...], fraction: str, offset: str, zone: tzinfo | None
 ) -> tuple[datetime | None, float]:
-    """Return a time and the unit of its last digit, s; None if there is no time zone."""
+    """Return a time and the unit of its last digit, s; the time is None if it has no zone."""
     match = re.fullmatch(r"([+-])(\d\d)[:-]?(\d\d)", offset)
     if match:
         minutes = 60 * int(match[2]) + int(match[3])
@@ -576,7 +576,7 @@ def _text_time(text: str) -> tuple[datetime | None, float]:
 
 
 def _exposure(tags: Mapping[int, Any]) -> tuple[float, float]:
-    """Return the exposure, s, and the gain, ISO/100; NaN where EXIF says nothing."""
+    """Return the exposure, s, and the gain, ISO/100; NaN for what EXIF does not state."""
     values = []
     for tag, unit in ((0x829A, 1.0), (0x8827, 0.01)):
         value = tags.get(tag)
@@ -590,7 +590,7 @@ def _exposure(tags: Mapping[int, Any]) -> tuple[float, float]:
 
 
 def _own_values(text: str) -> dict[str, float]:
-    """Return the numbers that `write_image` left in a PNG."""
+    """Return the numbers that `write_image` stored in a PNG."""
     values = None
     with suppress(ValueError, RecursionError):
         values = json.loads(text)
@@ -602,7 +602,7 @@ def _own_values(text: str) -> dict[str, float]:
 
 
 def write_image(image: Frame | Pixels, path: str | Path, *, quality: int = 95) -> None:
-    """Write a PNG, JPEG or TIFF, chosen by suffix, completely or not at all.
+    """Write a PNG, JPEG or TIFF, as the suffix says, completely or not at all.
 
     Parameters
     ----------
@@ -628,7 +628,7 @@ def write_image(image: Frame | Pixels, path: str | Path, *, quality: int = 95) -
 def encode_image(
     image: Frame | Pixels, suffix: str, quality: int = 95, name: str = "image"
 ) -> bytes:
-    """Return the bytes of an image file as `write_image` writes them; errors quote ``name``.
+    """Return the bytes that `write_image` would write; error messages quote ``name``.
 
     Raises
     ------

@@ -15,15 +15,15 @@ Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 #: Values on a grid of pixels, of any type that OpenCV handles.
 Image = npt.NDArray[Any]
 
-#: Pixels above this share of a channel's white may be clipped; tone curves end below it.
+#: Pixels above this fraction of a channel's white level may be clipped; tone curves end below it.
 CLIPPED = 0.985
 #: Weights of blue, green and red in the brightness (Rec. 601), in 255ths.
 _SHARES = (29, 150, 76)
 _SQUARED = np.round(np.arange(256) ** 2 / 255.0).astype(np.uint8)
-#: Criteria for a plateau below full scale: this many times more pixels between CLIPPED and 1 of the
-#: highest value than in an equal band below; the number of pixels that may be brighter (hot
-#: pixels); and the minimum number of values between _NEAR and 1, below which the bands say nothing.
-#: The smooth top of a beam has a ratio of 1.
+#: Criteria for a plateau below full scale. The band between CLIPPED and 1 times the highest value
+#: must have this many times more pixels than an equal band below it; for the smooth peak of a beam
+#: this ratio is 1. The second number is how many pixels may be brighter (hot pixels). The third is
+#: the minimum number of values between _NEAR and 1, below which the bands say nothing.
 _PLATEAU, _HOT, _VALUES, _NEAR = 8.0, 16, 4, 0.94
 
 
@@ -36,7 +36,7 @@ class Frame:
     pixels
         Grey (H, W) or blue-green-red (H, W, 3), uint8 or uint16.
     name
-        Path of a file, or a source and a frame number.
+        Path of the file, or a source and a frame number.
     time
         Middle of the exposure, with a time zone; None if unknown.
     time_deviation
@@ -80,10 +80,10 @@ class Frame:
 
     @cached_property
     def clipped(self) -> npt.NDArray[np.uint8]:
-        """How much each pixel is clipped, 0 to 255, (H, W).
+        """Degree to which each pixel is clipped, 0 to 255, (H, W).
 
-        This is the squared fraction of the brightness that comes from channels at their white
-        level, because clipping shifts a centroid in proportion to that fraction, and so increases
+        This is the square of the fraction of the brightness that comes from channels at their white
+        level. Clipping shifts a centroid in proportion to that fraction, and therefore increases
         its variance with the square. The white level is full scale, or the plateau below it at
         which a channel saturates: video levels end at 235, and a 12-bit sensor at 4095 of 65535.
         """
@@ -98,12 +98,12 @@ class Frame:
         return _SQUARED[out]
 
     def linear(self, gamma: float) -> "Frame":
-        """Return a 16-bit frame with pixels proportional to light; itself if gamma is 1.
+        """Return a 16-bit frame with pixels proportional to light; this frame if gamma is 1.
 
         Parameters
         ----------
         gamma
-            The pixel values are light to the power 1/gamma.
+            Exponent of the camera response: pixel values are light to the power 1/gamma.
 
         Raises
         ------
@@ -131,7 +131,7 @@ class Frame:
 
 
 def _white(channel: Image, full_scale: float) -> float:
-    """Return the value at which a channel (H, W) clips: its plateau if any, or full scale."""
+    """Return the value at which a channel (H, W) clips: a plateau if any, else full scale."""
     import cv2
 
     levels = int(full_scale) + 1
@@ -141,7 +141,7 @@ def _white(channel: Image, full_scale: float) -> float:
     if not high.any():
         return full_scale
     top = int(np.flatnonzero(high)[-1])
-    # Two bands below the limit, so that each holds several of 256 values.
+    # Both bands are wide enough to hold several of 256 values.
     upper, lower = (int(np.ceil(share * top)) for share in (CLIPPED, 3.0 * CLIPPED - 2.0))
     below = 0.5 * (above[lower] - above[upper])
     values = np.count_nonzero(counts[int(_NEAR * top) : top + 1])

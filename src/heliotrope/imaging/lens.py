@@ -1,7 +1,7 @@
 """Lens calibration from pictures of a chessboard.
 
-A deviation in pixels is two-dimensional, the root mean square length of the residuals. A ``sigma``
-is that of one coordinate.
+A deviation in pixels is two-dimensional: the root mean square length of the residuals. A ``sigma``
+is the standard deviation of one coordinate.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from heliotrope.field.camera import Camera
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.optics.coverage import coverage
 
-#: Distortion models: terms of Brown and Conrady in each.
+#: Distortion models, with the Brown-Conrady terms that each contains.
 MODELS: dict[str, tuple[int, ...]] = {
     "none": (), "k1": (0,), "k1 k2": (0, 1), "k1 k2 p1 p2": (0, 1, 2, 3),
     "k1 k2 p1 p2 k3": (0, 1, 2, 3, 4),
@@ -34,12 +34,13 @@ class Chessboard:
     Attributes
     ----------
     name, corners
-        Name of the picture; its inner corners, row by row, px, (N, 2), or None if not found.
+        Name of the picture, and its inner corners, row by row, px, (N, 2); None if they were not
+        found.
     reason
-        Why it was not used for the lens; empty if it was.
+        Why the picture was not used for the lens; an empty string if it was used.
     deviation, tilt
-        RMS of its residuals, px; angle between its normal and the optical axis, rad; NaN if
-        unknown.
+        RMS of the residuals, px, and angle between the board's normal and the optical axis, rad;
+        NaN if unknown.
     """
 
     name: str
@@ -50,7 +51,7 @@ class Chessboard:
 
     @property
     def used(self) -> bool:
-        """Whether it was used for the lens."""
+        """Whether the picture was used for the lens."""
         return not self.reason
 
 
@@ -66,9 +67,9 @@ class Lens:
         Standard deviations of both focal lengths, the principal point (px) and the five distortion
         coefficients, (9,); 0 for terms outside the model (`MODELS`).
     boards, coverage
-        All pictures, in their order; fraction of the frame that the boards cover.
+        All pictures, in order, and the fraction of the frame that the boards cover.
     notes
-        Notes, in sentences.
+        Notes, as sentences.
     """
 
     size: tuple[int, int]
@@ -87,12 +88,12 @@ class Lens:
 
 
 def find_chessboard(grey: npt.ArrayLike, pattern: tuple[int, int]) -> FloatArray | None:
-    """Return the inner corners, px (columns * rows, 2), in a picture (H, W), or None."""
+    """Return the inner corners in a picture (H, W), px, (columns * rows, 2); None if not found."""
     import cv2
 
     picture: Any = _eight_bit(grey)
-    # Errors on drawn boards: 0.04 to 0.1 px by SB without flags, 0.2 to 0.4 px with EXHAUSTIVE,
-    # and 0.03 to 0.06 px after cornerSubPix, whatever the start.
+    # On synthetic boards the errors are 0.04 to 0.1 px with SB without flags, 0.2 to 0.4 px with
+    # EXHAUSTIVE, and 0.03 to 0.06 px after cornerSubPix, whatever the start.
     complete, corners = cv2.findChessboardCornersSB(picture, pattern)
     if not complete:
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
@@ -117,7 +118,7 @@ def _eight_bit(grey: npt.ArrayLike) -> npt.NDArray[np.uint8]:
         raise InputError(f"{what}; pass a grey image (H, W), uint8 or uint16")
     if picture.dtype == np.uint8:
         return np.ascontiguousarray(picture)
-    # Sensors of 10 or 12 bit leave the upper bits empty.
+    # Sensors with 10 or 12 bits leave the upper bits empty.
     top = max(float(picture.max()), 1.0)
     return np.asarray(np.round(picture * (255.0 / top)), dtype=np.uint8)
 
@@ -133,14 +134,14 @@ def calibrate_chessboard(
     Parameters
     ----------
     images
-        Grey (H, W), uint8 or uint16, all of one size; with the board tilted by 20° to 45° in
-        different directions, in all parts of the frame.
+        Grey pictures (H, W), uint8 or uint16, all of the same size. The board should be tilted by
+        20° to 45° in different directions and appear in all parts of the frame.
     pattern
         Columns and rows of inner corners.
     square
         Side of a square, m.
     names
-        Names of the pictures; "picture 1" and so on if not given.
+        Names of the pictures; default: "picture 1" and so on.
 
     Raises
     ------
@@ -174,10 +175,10 @@ def calibrate_corners(
     square: float,
     names: Sequence[str],
 ) -> Lens:
-    """Return the lens from given corners; otherwise as `calibrate_chessboard`.
+    """Calibrate a lens from given corners, in the same way as `calibrate_chessboard`.
 
-    ``corners`` has one entry for each picture, px (columns * rows, 2), or None. The distortion
-    model is the one with the least Bayesian information criterion.
+    ``corners`` has one entry per picture, px, (columns * rows, 2), which may be None. The
+    distortion model is the one with the smallest Bayesian information criterion.
     """
     if not (np.isfinite(square) and square > 0.0):
         raise InputError(f"the side of a square must be above 0, not {square} m")
@@ -209,7 +210,7 @@ def calibrate_corners(
 def _solve(
     size: tuple[int, int], points: FloatArray, boards: Sequence[Chessboard], model: str
 ) -> tuple[Lens, float, FloatArray]:
-    """Return the lens of a model, its information criterion, and the boards' normals."""
+    """Return the lens fitted with a model, its information criterion, and the board normals."""
     import cv2
 
     kept = (
@@ -262,10 +263,10 @@ _FRONTAL = (
 def _without_outliers(
     size: tuple[int, int], points: FloatArray, boards: Sequence[Chessboard]
 ) -> list[Chessboard]:
-    """Leave out boards with far larger residuals than the others, the worst first."""
+    """Leave out boards with far larger residuals than the other boards, the worst first."""
     kept = list(boards)
     while sum(board.used for board in kept) > 3:
-        # With all terms, so that no board is blamed for distortion.
+        # The model has all terms, so that no board is rejected because of distortion.
         solved = _solve(size, points, kept, "k1 k2 p1 p2 k3")[0].boards
         apart = np.array([board.deviation if board.used else np.nan for board in solved])
         usual, worst = float(np.nanmedian(apart)), int(np.nanargmax(apart))

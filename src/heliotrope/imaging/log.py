@@ -29,7 +29,7 @@ class Entry:
     heliostat
         Heliostat that sends the beam; empty if unknown.
     counts
-        Motor counts, (D,); None if unknown.
+        Drive counts, (D,); None if unknown.
     target
         Target to which the beam was sent; empty if unknown.
     time
@@ -37,7 +37,7 @@ class Entry:
     sun
         Unit vector to the apparent sun, ENU, (3,); None if unknown.
     empty
-        Photograph by the same camera without the beam, from the same minute, or None.
+        Photograph by the same camera without the beam, from the same minute; None if there is none.
     """
 
     heliostat: str = ""
@@ -87,13 +87,13 @@ def read_log(path: str | Path) -> Log:
     Parameters
     ----------
     path
-        A table with the columns `COLUMNS`, such as Jülich's ``measurements.csv``. ``empty`` is
-        relative to the folder of the log.
+        A table with the columns `COLUMNS`, such as Jülich's ``measurements.csv``. Paths in the
+        column ``empty`` are relative to the folder of the log.
 
     Raises
     ------
     FormatError
-        If it cannot be read, lacks a required value, or has two entries for one photograph.
+        If the table cannot be read, lacks a required value, or has two entries for one photograph.
     """
     rows = read_rows(Path(path), "a log of photographs (CSV)", COLUMNS)
     rows.need(["heliostat", *_MOTORS])
@@ -138,21 +138,22 @@ def read_log(path: str | Path) -> Log:
 
 
 def _sun(azimuth_deg: float, elevation_deg: float) -> FloatArray | None:
-    """Return the direction for PAINT's azimuth: 0 is south, east is positive."""
+    """Return the direction for an azimuth as in PAINT, with 0 south and east positive."""
     if not (np.isfinite(azimuth_deg) and np.isfinite(elevation_deg)):
         return None
     return direction(np.pi - np.radians(azimuth_deg), np.radians(elevation_deg))
 
 
 def beside(path: Path, heliostat: str = "") -> Entry | None:
-    """Return the entry in PAINT's file beside a photograph; None if no such file.
+    """Return the entry in PAINT's file beside a photograph; None if there is no such file.
 
     Parameters
     ----------
     path
-        ``ID/Calibration/137608-raw.png`` with ``137608-calibration-properties.json``.
+        Photograph, such as ``ID/Calibration/137608-raw.png``; PAINT's file beside it is
+        ``137608-calibration-properties.json``.
     heliostat
-        Used if the folder does not name it.
+        Name of the heliostat, used if the folder does not state it.
 
     Raises
     ------

@@ -40,7 +40,7 @@ class Memory:
         return self._models
 
     def learn(self, faces: Iterable[LookedAt]) -> None:
-        """Update the models from faces, except where beams are.
+        """Update the models from faces, except where there are beams.
 
         A face that is mostly covered by beams or shadows, or has a different grid than before, is
         skipped.
@@ -87,7 +87,7 @@ class Memory:
             model.save(place / f"{name}.npz")
 
 
-#: Minimum beam-free share of a face's paint for learning.
+#: Minimum beam-free fraction of a face's paint for learning.
 _LEAST_FREE = 0.3
 
 

@@ -1,7 +1,7 @@
-"""Motion between frames: whether and where a beam moved, and how significant the motion is.
+"""Detect motion between frames: whether and where a beam moved, and how significantly.
 
 Two frames from a fixed camera differ not only by a beam but also by noise, exposure, clouds, and
-wind on the mast. Each of these effects is modelled and removed before a difference counts:
+wind on the mast. Each of these effects is modelled and removed before differences are examined:
 
 1. Frames are reduced to at most 400 × 300 px, which also averages noise.
 2. Gain (with a slope across the frame) and offset are fitted robustly to cell means.
@@ -9,8 +9,8 @@ wind on the mast. Each of these effects is modelled and removed before a differe
    phase correlation if it is large. It is accepted only if tiles all over the frame agree, because
    a single beam in the dark must not be mistaken for a shaken camera.
 4. The difference is examined at three scales. Its standard deviation is measured for each level of
-   brightness (photon noise) and per gradient (residuals of a shift at edges). The smaller value of
-   the two frames counts, so that a beam does not raise the noise at its new position.
+   brightness (photon noise) and per gradient (residuals of a shift at edges). Of the two frames'
+   values the smaller one is used, so that a beam does not raise the noise at its new position.
 5. The threshold follows from the number of independent positions and the false-alarm rate.
 """
 
@@ -25,23 +25,24 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.imaging.frame import Frame, Pixels
 
-_WIDTH, _HEIGHT = 400, 300  # of reduced frames
-_CELL = 8  # reduced pixels of a cell whose mean enters the fit of gain and offset
+_WIDTH, _HEIGHT = 400, 300  # size of reduced frames
+_CELL = 8  # side, reduced px, of a cell whose mean enters the fit of gain and offset
 _TILES, _SCALES, _LEVELS = (8, 6), 3, 8
-_SATURATED = 0.98  # of the full scale; above, a pixel does not show gain
-_PARTLY = 0.88  # of the full scale; above, a mean may contain saturated pixels
-#: Residuals of a shift at edges: medians per deviation; its bounds in reduced pixels; and its upper
-#: bound in pixels of the frame if no shift was accepted.
+_SATURATED = 0.98  # of full scale; brighter pixels do not show gain
+_PARTLY = 0.88  # of full scale; brighter means may contain saturated pixels
+#: Residuals of a shift at edges: median per standard deviation; bounds in reduced pixels; and upper
+#: bound in frame pixels if no shift was accepted.
 _EDGE, _LEAST_EDGE, _MOST_EDGE, _UNSURE = 2.0, 0.02, 0.1, 0.75
 _APART = 4  # pixels between samples of noise; more than smoothing correlates
-#: Factor on the threshold of normal noise: its deviation is estimated, and edges have tails.
+#: Factor on the threshold for normal noise, because its standard deviation is only estimated and
+#: edges have heavy tails.
 _MARGIN = 1.2
-#: For white noise smoothed as for the shift: mean squared gradient of the mean of two frames over
-#: that of their difference; and pixels per independent value.
+#: For white noise, smoothed as for the shift: mean squared gradient of the mean of two frames,
+#: divided by the mean square of their difference; and pixels per independent value.
 _NOISE_GRADIENT, _JOINED = 0.064, 4.3
 _NORMAL = 1.4826  # standard deviation over the median absolute value of a normal distribution
-_Image = npt.NDArray[Any]  # (H, W), float32 unless said
-_Pair = tuple[float, float]  # right and down, pixels
+_Image = npt.NDArray[Any]  # (H, W), float32 unless stated
+_Pair = tuple[float, float]  # to the right and down, pixels
 
 
 @dataclass(frozen=True)
@@ -51,13 +52,13 @@ class Region:
     Attributes
     ----------
     appeared
-        Whether it became brighter rather than darker.
+        Whether the region became brighter rather than darker.
     area_px
-        Pixels of the frame.
+        Area, pixels of the frame.
     centroid_px
         Centroid of the difference, pixels right and down.
     significance
-        Greatest difference, in deviations of the noise.
+        Greatest difference, in standard deviations of the noise.
     """
 
     appeared: bool
@@ -79,15 +80,17 @@ class FrameMotion:
     area_px
         Total area of all regions, pixels of the frame.
     appeared_px, vanished_px
-        Centroids of added and of removed light, pixels right and down, or NaN.
+        Centroids of added and of removed light, pixels to the right and down; NaN if there is none.
     shift_px
         Shift of the scene to the right and down in the second frame; 0 if no shift was accepted.
     brightness_ratio
-        Brightness ratio of the static scene, second frame over first, in the middle of the frame.
+        Brightness of the static scene in the second frame divided by that in the first, in the
+        middle of the frame.
     regions
-        The most significant region first.
+        Regions, the most significant first.
     problem
-        Why the frames cannot be compared, in which case ``moved`` is false; empty if they can.
+        Why the frames cannot be compared, in which case ``moved`` is false; an empty string if they
+        can.
     """
 
     moved: bool = False
@@ -140,9 +143,9 @@ class _View:
     """A frame prepared for comparison: grey, with full scale 1, reduced by ``factor``."""
 
     image: _Image
-    cells: _Image  # float64, means of cells of it
+    cells: _Image  # float64, cell means of ``image``
     factor: int
-    step: float  # one digit, of the full scale
+    step: float  # one digit, as a fraction of full scale
     size: tuple[int, int]
 
 
@@ -159,8 +162,8 @@ def detect_motion(
     before, after
         Frames, or pixels (H, W) or (H, W, 3) of uint8 or uint16, of the same size.
     mask
-        Mask of where motion counts, (H, W), true or not 0; None: everywhere. The rest of the frame
-        is still used to measure shift and brightness.
+        Mask of where motion counts, (H, W), true or not 0; None for everywhere. The rest of the
+        frame is still used to measure shift and brightness.
     settings
         Thresholds.
 
@@ -176,9 +179,9 @@ def detect_motion(
 def find_shift(before: Frame | Pixels, after: Frame | Pixels) -> _Pair | None:
     """Return the shift of the scene to the right and down in ``after``, pixels.
 
-    None if no shift explains tiles all over the frames, because they lack texture or show different
-    scenes. Below 1 px it is accurate to about 0.05 px where there is texture. Raises InputError if
-    the sizes differ.
+    The result is None if no shift explains tiles all over the frames, because they lack texture or
+    show different scenes. A shift below 1 px is accurate to about 0.05 px where there is texture.
+    Raises InputError if the sizes differ.
     """
     first, second = _view(before), _view(after)
     shift = _register(_expected(first, second)[0], second.image)
@@ -200,7 +203,7 @@ def _view(picture: Frame | Pixels) -> _View:
     factor = max(1, math.ceil(width / _WIDTH), math.ceil(height / _HEIGHT))
     grey = frame.grey
     if factor > 1:
-        # Whole blocks only: the weights of a fractional reduction vary over the frame.
+        # Reduce by whole blocks, because the weights of a fractional reduction vary over the frame.
         size = (width // factor, height // factor)
         grey = grey[: size[1] * factor, : size[0] * factor]
         grey = cv2.resize(grey.astype(np.float32), size, interpolation=cv2.INTER_AREA)
@@ -239,8 +242,8 @@ def _cells(image: _Image) -> _Image:
 def _expected(first: _View, second: _View) -> tuple[_Image, float]:
     """Return the first frame at the brightness of the second, and the brightness ratio.
 
-    Gain, its slopes across the frame and the offset are fitted with Tukey's weights. Without
-    contrast, offset and gain cannot be separated, and the offset is left out.
+    The gain, its slopes across the frame and the offset are fitted with Tukey's weights. Without
+    contrast, offset and gain cannot be separated, so the offset is left out.
     """
     if first.size != second.size:
         raise InputError(
@@ -286,7 +289,7 @@ def _fitted(design: _Image, b: _Image, start: float, step: float) -> tuple[_Imag
 
 
 def _register(a: _Image, b: _Image) -> _Pair | None:
-    """Return the shift of b against a, pixels; None if no shift is accepted."""
+    """Return the shift of b relative to a, pixels; None if no shift is accepted."""
     import cv2
 
     if min(a.shape) < 32:
@@ -294,7 +297,7 @@ def _register(a: _Image, b: _Image) -> _Pair | None:
     near = _refine(a, b, (0.0, 0.0))
     if near is not None and math.hypot(*near[1]) < 0.5:
         return near[1]
-    # Half the size is four times as fast, and accurate enough as a start.
+    # Half the size is four times as fast, and accurate enough as a starting value.
     size = (a.shape[1] // 2, a.shape[0] // 2)
     halves = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (a, b)]
     (x, y), _ = cv2.phaseCorrelate(halves[0], halves[1], cv2.createHanningWindow(size, cv2.CV_32F))
@@ -328,8 +331,8 @@ def _moved(image: _Image, x: float, y: float) -> _Image:
 
     if x == 0.0 and y == 0.0:
         return image
-    # The cubic kernel of Keys (1981, a = -0.5) at the exact position. OpenCV's warp would round the
-    # position to 1/32 px, which errs by 3 digits at an edge of 200 digits.
+    # Use the cubic kernel of Keys (1981, a = -0.5) at the exact position. OpenCV's warp would round
+    # the position to 1/32 px, an error of 3 digits at an edge of 200 digits.
     whole = [math.floor(x), math.floor(y)]
     kernels = []
     for part in (x - whole[0], y - whole[1]):
@@ -357,14 +360,14 @@ def _tile_shift(a: _Image, b: _Image) -> tuple[int, float, float] | None:
         cv2.resize(p, _TILES, interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
         for p in (gx * gx, gx * gy, gy * gy, gx * d, gy * d, d * d)
     )
-    # Noise has gradients too; those of the quietest tile are not texture.
+    # Noise has gradients too, and the gradients of the quietest tile are not texture.
     quiet = min(float(np.partition(dd, 4)[4]) * _NOISE_GRADIENT, float(min(xx.min(), yy.min())))
     xx, yy = xx - quiet, yy - quiet
     trace, determinant = xx + yy, xx * yy - xy * xy
     weaker = 0.5 * trace - np.sqrt(np.maximum(0.25 * trace * trace - determinant, 0.0))
     safe = np.where(determinant > 0.0, determinant, 1.0)
     dx, dy = (yy * xd - xy * yd) / safe, (xx * yd - xy * xd) / safe
-    # Deviation of a tile's shift in its weaker direction, from the residuals.
+    # Standard deviation of a tile's shift in its weaker direction, from the residuals.
     pixels = a.size / len(xx) / _JOINED
     residual = np.maximum(dd - xd * dx - yd * dy, 1e-12)
     deviation = np.sqrt(residual / np.maximum(pixels * weaker, 1e-30))
@@ -377,7 +380,7 @@ def _tile_shift(a: _Image, b: _Image) -> tuple[int, float, float] | None:
     spread = max(np.ptp(columns) / _TILES[0], np.ptp(rows) / _TILES[1]) if len(rows) else 0.0
     if len(rows) < max(4.0, 0.5 * good.sum()) or spread < 0.4:
         return None
-    # One solution of all tiles that agree, including those sharp in only one direction.
+    # Solve for all tiles that agree at once, including tiles with edges in only one direction.
     s = [v[near].sum() for v in (xx, xy, yy, xd, yd)]
     whole = s[0] * s[2] - s[1] * s[1]
     x, y = (s[2] * s[3] - s[1] * s[4]) / whole, (s[0] * s[4] - s[1] * s[3]) / whole
@@ -450,7 +453,7 @@ def _difference(
         expected, bright = _moved(expected, *shift), _moved(bright, *shift)
     expected = np.minimum(expected, np.float32(1.0))
     d = second.image - expected
-    # Partly saturated pixels show only that they are bright.
+    # Partly saturated pixels only show that they are bright.
     level = np.minimum(expected, second.image)
     blind = np.maximum(bright, second.image) > _PARTLY
     blind &= level > (_PARTLY - 0.1) * min(1.0, ratio)
@@ -480,7 +483,7 @@ def _deviation(parts: list[_Image], step: float, edge: float) -> _Image:
     samples[3] = samples[0] - beside[0]
     rest, light, slope, apart = (np.abs(sample[known]) for sample in samples)
     order = np.argsort(light)[: len(light) // _LEVELS * _LEVELS]
-    # In each bin of brightness, the half with lesser gradients shows the noise.
+    # In each brightness bin, the half with the smaller gradients shows the noise.
     bins = order.reshape(_LEVELS, -1)
     flat = np.argpartition(slope[bins], bins.shape[1] // 2, axis=1)[:, : bins.shape[1] // 2]
     flat = np.take_along_axis(bins, flat, axis=1)
@@ -488,10 +491,10 @@ def _deviation(parts: list[_Image], step: float, edge: float) -> _Image:
     places = _median(light[flat])
     digits = np.arange(256) / 255.0
     table = np.interp(digits, places, noise)
-    # Above the brightest bin, photon noise grows with the root of the brightness.
+    # Above the brightest bin, photon noise grows with the square root of the brightness.
     table *= np.sqrt(np.maximum(digits / max(float(places[-1]), 1e-3), 1.0))
     quiet = cv2.LUT(cv2.convertScaleAbs(level, alpha=255.0), table.astype(np.float32))
-    # Residuals of a shift per gradient, where the gradient is greatest.
+    # These are the residuals of a shift per gradient, where the gradient is greatest.
     sharp = np.argpartition(slope, -(len(slope) // 32))[-(len(slope) // 32) :]
     excess = np.square(rest[sharp]) - np.square(quiet[every].ravel()[known][sharp])
     ratio = np.sqrt(np.maximum(excess, 0.0)) / np.maximum(slope[sharp], 1e-9)
@@ -546,7 +549,7 @@ def _threshold(places: float, settings: MotionSettings) -> float:
 def _regions(
     z: _Image, weight: _Image, threshold: float, appeared: bool, unit: int, least: float
 ) -> list[tuple[Region, float]]:
-    """Return regions above 0.6 of the threshold that exceed it somewhere, with their weights."""
+    """Return regions above 0.6 times the threshold that exceed it somewhere, and weights."""
     import cv2
 
     grown = (z > 0.6 * threshold).astype(np.uint8)
@@ -603,7 +606,7 @@ class MotionDetector:
     mask, settings
         See `detect_motion`.
     memory
-        Frames after which the weight of a frame falls to 1/e.
+        Number of frames after which the weight of a frame falls to 1/e.
     warm_up
         Number of frames before the first verdict.
     """
@@ -627,7 +630,7 @@ class MotionDetector:
     def update(self, frame: Frame | Pixels) -> tuple[MotionState, FrameMotion]:
         """Compare the next frame with the background.
 
-        Raises InputError if the mask does not fit, or if the frame size changed.
+        It raises InputError if the mask does not fit, or if the frame size changed.
         """
         view = _view(frame)
         mask = _mask(self._mask, view)

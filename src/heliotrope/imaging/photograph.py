@@ -1,4 +1,4 @@
-"""Evaluates a photograph: its targets, their spots in metres with covariance, and any defects."""
+"""Evaluate a photograph: its targets, their spots in metres with covariance, and defects."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -37,7 +37,7 @@ class TargetReading:
     spots
         Spots on the target: the intended spot first, then by power.
     reasons
-        Reasons against the first spot; empty if it is valid.
+        Reasons why the first spot is not valid; empty if it is valid.
     """
 
     found: FoundTarget
@@ -52,7 +52,7 @@ class TargetReading:
 
 @dataclass(frozen=True)
 class LookedAt:
-    """A face and its background: for pictures, and for learning the empty target.
+    """A face and its background, used for pictures and for learning the empty target.
 
     Attributes
     ----------
@@ -61,7 +61,8 @@ class LookedAt:
     background
         The face without beams.
     unexplained
-        Share of its paint beside the spots that is brighter or darker than the background.
+        Fraction of the face's paint beside the spots that is brighter or darker than the
+        background.
     """
 
     picture: Rectified
@@ -78,11 +79,11 @@ class Photograph:
     frame
         The photograph.
     readings
-        One per target that was searched for.
+        One reading per target that was searched for.
     beside
         Spots on a face that was found, but on none of its targets.
     faces
-        Each face that was found.
+        The faces that were found.
     """
 
     frame: Frame
@@ -91,7 +92,7 @@ class Photograph:
     faces: tuple[LookedAt, ...] = ()
 
     def reading(self, target: str) -> TargetReading:
-        """Return the reading of a target by name.
+        """Return the reading of a target, given by name.
 
         Raises
         ------
@@ -105,7 +106,7 @@ class Photograph:
 
     @property
     def views(self) -> tuple[FaceView, ...]:
-        """How the faces lie in the frame; in the next frame the search starts there."""
+        """How the faces lie in the frame, which is where the search in the next frame starts."""
         return tuple(f.picture.view for f in self.faces if f.picture.view is not None)
 
 
@@ -121,11 +122,11 @@ class PhotographSettings:
         "frame", "model" (with ``empty``) or "difference" (with an empty frame); "auto" uses the
         best available method.
     empty
-        Models of empty faces under any names; a face selects its model by its targets.
+        Models of empty faces, under any names; the model of a face is selected by its targets.
     expectations
-        Expected beams by target.
+        Expected beams, keyed by target.
     pictures
-        Pictures of taught marks, by their code.
+        Reference pictures of user-defined marks, keyed by the code of the mark.
     gamma
         Exponent of the camera response: a pixel is light to the power 1/gamma. 1 is linear, 2.2 is
         close to sRGB. The response is inverted before anything is measured.
@@ -133,7 +134,7 @@ class PhotographSettings:
         User-defined function that returns the position and covariance of the first spot on each
         target and replaces the built-in one; see `heliotrope.imaging.spots.BeamPicture`. If
         photographs are evaluated in several processes, it must be defined in a module that these
-        can import.
+        processes can import.
     """
 
     limits: Limits = field(default_factory=Limits)
@@ -220,7 +221,7 @@ def read_crop(
     frame
         Picture whose corners are those of the target, of any size.
     target
-        The target that it shows.
+        The target that the picture shows.
     settings
         Evaluation settings.
     """
@@ -250,7 +251,7 @@ def _by_view(results: Sequence[FoundTarget]) -> list[tuple[FaceView, list[FoundT
 def _empty_picture(
     without: Frame, view: FaceView, camera: Camera | None, chosen: PhotographSettings, rim: int
 ) -> Rectified:
-    """Locate the face again in the frame without the beam, because the camera may have moved."""
+    """Return the face in the frame without the beam, located anew if the camera moved."""
     again = find_targets(without, list(view.face.targets), camera, [view], chosen.pictures)
     known = next((f.view for f in again if f.view is not None), None)
     if known is None:

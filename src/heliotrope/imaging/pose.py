@@ -1,7 +1,7 @@
-"""Locates a camera from known points, with a known or unknown lens.
+"""Locate a camera from known points, with a known or unknown lens.
 
-A deviation in pixels is two-dimensional, the root mean square length of the residuals. A ``sigma``
-is that of one coordinate.
+A deviation in pixels is two-dimensional: the root mean square length of the residuals. A ``sigma``
+is the standard deviation of one coordinate.
 """
 
 from collections.abc import Sequence
@@ -15,9 +15,10 @@ from heliotrope.field.camera import Camera
 from heliotrope.geometry import FloatArray, as_float, as_vectors, cross_matrix
 from heliotrope.imaging.lens import Lens
 
-#: Priors for marks alone: log focal length over width ±, principal point over width ±, k1 ±.
+#: Priors for a calibration from marks alone: log of focal length over width and its standard
+#: deviation; standard deviations of principal point over width, and of k1.
 LOG_FOCAL, LOG_FOCAL_SIGMA, CENTER_SIGMA, K1_SIGMA = np.log(3.0), 1.5, 0.02, 0.1
-#: Rows of the covariance of a `CameraFit`.
+#: Names of the rows of a `CameraFit` covariance.
 POSE = ("turn_right", "turn_down", "turn_forward", "east", "north", "up")
 INNER = ("log_focal", "center_x", "center_y", "k1")
 
@@ -29,17 +30,18 @@ class CameraFit:
     Attributes
     ----------
     camera, residuals
-        The camera with its pose; observed minus predicted pixels, (N, 2).
+        The camera with its pose, and observed minus predicted pixels, (N, 2).
     names, covariance
-        Covariance with the parameters `POSE`, then `INNER` if solved; (6, 6) or (10, 10). Rotations
-        are about the camera's own axes, rad; the position is in ENU metres.
+        Parameter names and their covariance, (6, 6) or (10, 10). The parameters are `POSE`,
+        followed by `INNER` if these were also solved for. Rotations are about the camera's own
+        axes, rad; the position is in ENU metres.
     plane_sigma
-        Predicted standard deviation, per coordinate, of a pixel's position on the plane of the
-        points, between the points, m; from the camera error alone.
+        Predicted standard deviation per coordinate, m, of a pixel's position on the plane of the
+        points, between the points, due to the camera error alone.
     other
-        A second pose that explains the points equally well, or None.
+        A second pose that explains the points equally well; None if there is none.
     notes
-        Parameters that the points do not determine, and contradictions, in sentences.
+        Sentences about parameters that the points do not determine, and about contradictions.
     """
 
     camera: Camera
@@ -65,9 +67,9 @@ def resection(
 ) -> CameraFit:
     """Return the pose of a camera with a known lens.
 
-    Both poses from a plane (Collins and Bartoli 2014, IPPE) and the pose from the general problem
-    (SQPnP) are refined by least squares. The covariance includes the noise of the points; the lens
-    is treated as exact.
+    The two poses from a plane (Collins and Bartoli 2014, IPPE) and the pose from the general
+    problem (SQPnP) are refined by least squares. The covariance includes the noise of the points;
+    the lens is treated as exact.
 
     Parameters
     ----------
@@ -101,9 +103,9 @@ def calibrate_marks(
 ) -> CameraFit:
     """Calibrate a camera from points alone.
 
-    Solves for pose, focal length (square pixels), principal point and k1. The last three have
-    priors: 3 frame widths within a factor of 4.5, the frame centre ± 2 % of the width, and 0 ± 0.1.
-    Parameters that the points do not determine keep their priors.
+    The function solves for pose, focal length (square pixels), principal point and k1. The last
+    three have priors: 3 frame widths within a factor of 4.5, the frame centre ± 2 % of the width,
+    and 0 ± 0.1. Parameters that the points do not determine keep their priors.
 
     Parameters
     ----------
@@ -113,7 +115,7 @@ def calibrate_marks(
         Points and pixels as for `resection`, for each frame of a camera that does not move between
         frames; four or more points in total. Errors are those of `resection`.
     sigma
-        As for `resection`, or a list with one entry per frame.
+        As for `resection`, or a list with one entry for each frame.
     name
         Name of the camera.
     """
@@ -138,7 +140,7 @@ def calibrate_marks(
 
 
 def _pinhole(size: tuple[int, int], wide: float, name: str) -> Camera:
-    """Return a camera without distortion with a focal length of ``wide`` frame widths."""
+    """Return a camera without distortion, with a focal length of ``wide`` frame widths."""
     f, (cx, cy) = wide * size[0], (0.5 * (size[0] - 1), 0.5 * (size[1] - 1))
     return Camera(name, size, np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]]))
 
@@ -172,13 +174,13 @@ class _Problem:
         )
 
     def turn(self, x: FloatArray) -> FloatArray:
-        """Return the rotation from ENU to camera axes, (3, 3)."""
+        """Return the rotation from ENU to camera axes, (3, 3), for a vector of unknowns."""
         import cv2
 
         return as_float(cv2.Rodrigues(x[:3])[0])
 
     def lens(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return lens matrix and distortion for a vector of unknowns."""
+        """Return the lens matrix and distortion for a vector of unknowns."""
         if not self.free:
             return self.base.matrix, self.base.distortion
         f = float(np.exp(np.clip(x[6], -20.0, 20.0)))
@@ -200,19 +202,19 @@ class _Problem:
         return as_float(projected).reshape(-1, 2), np.concatenate(parts, axis=-1)
 
     def shift(self, x: FloatArray) -> FloatArray:
-        """Return the translation, m."""
+        """Return the translation, m, for a vector of unknowns."""
         return x[3:6] * self.lens(x)[0][0, 0] if self.free else x[3:6]
 
     @property
     def prior(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and standard deviation of log focal length, principal point and k1."""
+        """Prior mean and standard deviation of log focal length, principal point and k1."""
         width, height = self.base.size
         mean = [LOG_FOCAL + np.log(width), 0.5 * (width - 1), 0.5 * (height - 1), 0.0]
         sigma = [LOG_FOCAL_SIGMA, CENTER_SIGMA * width, CENTER_SIGMA * width, K1_SIGMA]
         return np.array(mean), np.array(sigma)
 
     def residuals(self, x: FloatArray) -> FloatArray:
-        """Return whitened residuals, those of the priors last."""
+        """Return whitened residuals, with the residuals of the priors last."""
         apart = self.predict(x, self.local)[0] - self.pixels
         white = np.einsum("nij,nj->ni", self.whitener, apart).ravel()
         mean, sigma = self.prior
@@ -228,7 +230,7 @@ class _Problem:
 def _observed(
     points: npt.ArrayLike, pixels: npt.ArrayLike, sigma: npt.ArrayLike
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return points, pixels and W (N, 2, 2) with ``W.T @ W`` the inverse of the covariance."""
+    """Return points, pixels and W (N, 2, 2), where ``W.T @ W`` is the inverse covariance."""
     where, observed, noise = as_vectors(points, "points"), as_float(pixels), as_float(sigma)
     if where.ndim != 2 or observed.shape != (len(where), 2):
         raise InputError(
@@ -313,11 +315,12 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
     camera = problem.camera(x)
     slopes = problem.slopes(x)
     freedom = len(slopes) - len(x)
-    # Scale only if chance explains the residuals in less than 1 %; otherwise it would add noise.
+    # Scale only if the probability of the residuals by chance is below 1 %; otherwise scaling would
+    # add noise.
     scale = chi2 / freedom if freedom and chi2 > chdtri(freedom, 0.01) else 1.0
     slopes[: 2 * len(problem.local)] /= np.sqrt(scale)
     close = [y for cost, y in solved[1:] if cost - chi2 < 9.0 * scale]
-    # Ignore the same pose reached from another start.
+    # Ignore the same pose if it was reached from another start.
     differ = [y for y in close if np.ptp(problem.turn(y) - problem.turn(x)) > 0.01]
     other = problem.camera(differ[0]) if differ else None
     size = np.linalg.norm(slopes, axis=0)
@@ -358,7 +361,7 @@ def _to_pose(problem: _Problem, x: FloatArray) -> FloatArray:
 
 
 def _plane_sigma(problem: _Problem, x: FloatArray, raw: FloatArray) -> float:
-    """Return the standard deviation of pixels' positions on the plane, at and between points."""
+    """Return the standard deviation of pixel positions on the plane, at and between points."""
     axes = np.linalg.svd(problem.local)[2][:2]
     few = problem.local[:: len(problem.local) // 40 + 1]
     points = (0.5 * (few + few[:, None])).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""The file of a receiver light reference (`receiver_light`): TOML, with a surroundings PNG."""
+"""Read and write a receiver light reference (`receiver_light`): TOML, and a PNG."""
 
 import math
 from pathlib import Path
@@ -16,7 +16,7 @@ from heliotrope.imaging.receiver_light import ReceiverReference, ReceiverSight
 
 
 class ReceiverLightDocument(BaseModel):
-    """The contents of the file; levels are linear, as fractions of full scale."""
+    """Contents of the file, with linear levels as fractions of full scale."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -76,7 +76,7 @@ def read_reference(path: str | Path) -> ReceiverReference:
 
 
 def write_reference(reference: ReceiverReference, path: str | Path) -> None:
-    """Write a reference as a file that `read_reference` reads, and its PNG beside it.
+    """Write a reference for `read_reference` to read, with its PNG beside it.
 
     Raises
     ------

@@ -1,22 +1,24 @@
-"""The light on a receiver in a camera frame, as a fraction of the nominal flux.
+"""Measure the light on a receiver in a camera frame, as a fraction of the nominal flux.
 
 If the pixels are proportional to light, the mean over the receiver's pixels increases in proportion
-to the flux. Daylight adds to it. The surroundings, a ring around the receiver outline that no beam
-should hit, show the daylight relative to that of the reference. With the black level b, the mean m
-over the receiver, and the mean s_i over each side of the ring (reference: index 0)
+to the flux. Daylight is added to the mean. The surroundings, a ring around the receiver outline
+that no beam should hit, show the daylight relative to that in the reference. With the black level
+b, the mean m over the receiver, and the mean s_i over each side of the ring (index 0 for the
+reference),
 
     a = min_i (s_i - b) / (s_i0 - b)
     share = ((m - b) - a (m_0 - b)) / rise
 
 where rise is the increase of the receiver mean at nominal flux. The side of the ring with the
-smallest ratio counts, so that a beam beside the receiver, or a cloud behind it, is not mistaken for
-daylight on the receiver.
+smallest ratio is used, so that a beam beside the receiver, or a cloud behind it, is not mistaken
+for daylight on the receiver.
 
 If frames do not state their exposure, a value of a below 1 may mean that the exposure has become
 shorter; in that case the fraction is divided by a.
 
-Darkness must be proven, light need not be: anything that may hide light (a lens cap, a moved
-camera, clipped pixels) makes the fraction a lower bound, and the reason is reported.
+The receiver is reported as dark only if nothing could hide light. Anything that may hide light (a
+lens cap, a moved camera, clipped pixels) makes the fraction a lower bound, and the reason is
+reported.
 """
 
 import math
@@ -33,32 +35,35 @@ from heliotrope.imaging.frame import Frame, Image
 
 Mask = npt.NDArray[np.bool_]
 
-#: Outline of the measured face, and inner and outer edge of the surroundings, as multiples of the
-#: receiver's outline about its middle.
+#: Outline of the measured face, and inner and outer edges of the surroundings, as the receiver's
+#: outline scaled about its middle by these factors.
 FACE, INNER, OUTER = 0.97, 1.15, 1.7
-#: Minimum pixels of the face, and of a side of the surroundings that counts; least number of sides.
+#: Minimum number of pixels of the face, and of a usable side of the surroundings; minimum number of
+#: usable sides.
 LEAST_FACE, LEAST_SIDE, LEAST_SIDES = 100, 40, 2
-#: Largest share of clipped pixels in the face, and in a side that counts.
+#: Largest fraction of clipped pixels in the face, and in a usable side.
 CLIPPED_FACE, CLIPPED_SIDE = 0.0005, 0.01
-#: Daylight on the surroundings, as a multiple of that of the reference, within which they show the
-#: daylight on the receiver.
+#: The surroundings show the daylight on the receiver only if their daylight, relative to that in
+#: the reference, is within these limits.
 DIMMEST, BRIGHTEST = 0.1, 4.0
-#: Share below which the receiver is darker than daylight alone would leave it.
+#: Below this fraction the receiver is darker than it would be in daylight alone.
 DARKER = -0.05
-#: Minimum likeness of the surroundings to those of the reference (1: the same), and the largest
-#: movement of the picture, as a share of the outline's diagonal.
+#: Minimum similarity between the surroundings and those in the reference (1 if identical), and
+#: largest movement of the picture, as a fraction of the outline's diagonal.
 LIKENESS, MOVED = 0.4, 0.02
-#: Largest relative change of exposure times gain, where frames state them.
+#: Largest relative change of exposure times gain, if frames state them.
 EXPOSED = 0.01
-#: Longer side of the picture in which the surroundings are recognised, and the largest movement
-#: that is searched for, px of it.
+#: Longer side of the reduced picture in which the surroundings are recognised, and the largest
+#: movement that is searched for, px of that picture.
 _LONGEST, _REACH = 320, 6
-#: Share of the surroundings, the steepest, by which they are recognised; and the deviation of the
-#: Gaussian that smooths them before, px of that picture.
+#: Fraction of the surroundings, with the steepest gradients, used to recognise them; and standard
+#: deviation of the Gaussian that smooths them beforehand, px of that picture.
 _STEEP, _SMOOTH = 0.08, 1.5
-#: Largest departure of a lit photograph from the common rise, as a share of its own.
+#: Largest difference between the rise of a photograph with beams and the common rise, as a fraction
+#: of its own rise.
 _LINEAR = 0.1
-#: Minimum and largest daylight of a lit photograph, as a multiple of that of the dark one.
+#: Minimum and maximum daylight of a photograph with beams, relative to that of the photograph
+#: without.
 _ALIKE = (0.7, 1.4)
 
 
@@ -69,7 +74,7 @@ class ReceiverSight:
     Attributes
     ----------
     camera, receiver
-        Names.
+        Names of the camera and the receiver.
     size
         Size of a frame, px.
     outline
@@ -169,7 +174,7 @@ class ReceiverReference:
     Attributes
     ----------
     sight
-        Where the camera sees it.
+        Where the camera sees the receiver.
     bits
         Bits per value in the camera's frames, 8 or 16.
     black
@@ -177,8 +182,8 @@ class ReceiverReference:
     face
         Level of the receiver in daylight without beams, above black.
     sides
-        Levels of its four sides of surroundings in daylight without beams, above black, (4,); NaN
-        where the frame does not show them.
+        Levels of the four sides of the surroundings in daylight without beams, above black, (4,);
+        NaN for a side that is not in the frame.
     rise
         Rise of the receiver's level at nominal flux.
     surroundings
@@ -219,7 +224,7 @@ class ReceiverReference:
 
     @property
     def daylight(self) -> float:
-        """The reference's daylight on the receiver, as a share of the nominal flux."""
+        """The reference's daylight on the receiver, as a fraction of the nominal flux."""
         return self.face / self.rise
 
 
@@ -233,7 +238,7 @@ class ReceiverLight:
         Fraction of the nominal flux, 0 or more; a lower bound if there is a ``doubt``; NaN if the
         frame cannot be measured at all.
     doubt
-        Why the flux may be higher; empty if there is no doubt.
+        Why the flux may be higher; an empty string if there is no doubt.
     cells
         Fraction of the nominal mean flux in each requested cell, (...); NaN outside the frame; None
         if no cells were requested.
@@ -271,7 +276,7 @@ def receiver_light(
     rise = levels.face - reference.black - max(daylight, 0.0) * reference.face
     share = rise / reference.rise
     doubt = _doubt(frame, levels, reference, daylight, int(counting.sum()), share)
-    # A darker picture may be one of a shorter exposure.
+    # A darker picture may have had a shorter exposure.
     stated = math.isfinite(frame.exposure * frame.gain * reference.exposure)
     dimmed = 1.0 if stated else min(max(daylight, DIMMEST), 1.0)
     cells = None
@@ -302,7 +307,7 @@ def _doubt(
     counting: int,
     share: float,
 ) -> str:
-    """Return the reason why the light may exceed the measurement; empty if none."""
+    """Return the reason why the light may exceed the measurement; an empty string if none."""
     exposure = frame.exposure * frame.gain
     if abs(exposure / reference.exposure - 1.0) > EXPOSED:
         return (
@@ -336,7 +341,7 @@ def _doubt(
 def _check_photographs(
     sight: ReceiverSight, capped: Frame, dark: Frame, with_beams: Sequence[tuple[Frame, float]]
 ) -> None:
-    """Raise InputError for a wrong size, an impossible fraction, or no photograph with beams."""
+    """Raise InputError if a size is wrong, a fraction is impossible, or no photograph has beams."""
     who = f"camera {sight.camera}"
     for frame in (capped, dark, *(frame for frame, _ in with_beams)):
         if frame.size != sight.size:
@@ -377,8 +382,8 @@ def take_reference(
         Photographs with beams, taken soon after ``dark``, each with its fraction of the nominal
         flux; the receiver must not be overexposed.
     bits
-        Bits per value in the camera's frames, if the frames passed are averages; None: as in
-        ``dark``.
+        Bits per value in the camera's frames, needed if the frames passed are averages; None for
+        the bits of ``dark``.
 
     Raises
     ------
@@ -489,7 +494,7 @@ def _bits(frame: Frame) -> int:
 
 
 def reduced(values: Image) -> Image:
-    """Return the means of blocks of pixels, so that the longer side has at most 320."""
+    """Return the means of pixel blocks, so that the longer side has at most 320 pixels."""
     import cv2
 
     factor = _factor(values.shape)
@@ -505,19 +510,19 @@ def _factor(shape: tuple[int, ...]) -> int:
 
 
 def _view_change(sight: ReceiverSight, usual: Image, now: Image) -> str:
-    """Return the reason why the surroundings differ from the reference; empty if they agree.
+    """Return why the surroundings differ from the reference; an empty string if they agree.
 
     Gradient directions are compared, weighted by the gradients of the reference, so that neither
     the brightness nor a veil over the picture matters.
     """
-    # Gradients at the inner edge of the ring belong to the receiver; those at the edge of the box
-    # are artefacts.
+    # Gradients at the inner edge of the ring belong to the receiver, and gradients at the edge of
+    # the box are artefacts.
     ring = reduced(sight.ring.astype(np.float32)) > 0.999
     inside = np.zeros_like(ring)
     inside[_REACH + 2 : -_REACH - 2, _REACH + 2 : -_REACH - 2] = True
     mine, theirs = _slopes(usual), _slopes(now)
     steep = np.where(ring & inside, np.linalg.norm(mine, axis=0), 0.0)
-    # Elsewhere, noise has gradients too.
+    # Only the steepest gradients are used, because elsewhere noise has gradients too.
     row, column = np.nonzero(steep > np.quantile(steep[ring & inside], 1.0 - _STEEP))
     mine = mine[:, row, column]
     theirs = theirs / (np.linalg.norm(theirs, axis=0) + 1e-9)

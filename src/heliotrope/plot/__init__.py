@@ -1,9 +1,9 @@
-"""Plots of days, errors, fields and mechanisms, on given axes or new ones.
+"""Plot days, errors, fields and mechanisms, on existing or new axes.
 
 `day`, `residuals`, `ellipses`, `field_map`, `year_map`, `drift`, `receiver_map`, `efficiency_map`
 and `flux_3d` draw on matplotlib axes and return them; reports use the same functions. `flux_figure`
 returns a figure of the field's flux, and `mechanism_3d` a plotly figure with a time slider (``pip
-install 'heliotrope[notebook]'``). Colours are distinguishable with colour blindness.
+install 'heliotrope[notebook]'``). Colour-blind readers can distinguish the colours.
 """
 
 from heliotrope.plot.charts import (

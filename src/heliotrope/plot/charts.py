@@ -1,4 +1,4 @@
-"""Charts on matplotlib axes."""
+"""Draw charts on matplotlib axes."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
@@ -18,7 +18,7 @@ from heliotrope.sun import Times, unix_seconds
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Colours of Okabe and Ito, which are distinguishable with colour blindness.
+#: Okabe and Ito's colours, which colour-blind readers can distinguish.
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#999999")
 #: Maximum number of names written beside the dots of a map.
 _NAMED = 60
@@ -34,7 +34,7 @@ class Group(NamedTuple):
     colour, label
         Style of the points, and their name in the legend.
     odd
-        Whether they are drawn as crosses and excluded from the axis limits, as for outliers.
+        Whether the points are drawn as crosses and excluded from the axis limits, as for outliers.
     """
 
     mask: npt.NDArray[np.bool_]
@@ -103,8 +103,8 @@ def day(
         A day of one heliostat, as `heliotrope.track_day` returns it; or T times, as for
         `heliotrope.sun.vector`.
     tracked
-        If times are passed: their solutions, batch shape (T,), of which the best branch is drawn;
-        or a path.
+        If times are passed: the tracking solutions at these times, batch shape (T,), of which the
+        best branch is drawn; or a path.
     joints
         Names of the drives.
     ax
@@ -189,7 +189,7 @@ def residuals(
         ax.plot(place[mask], errors[mask, 1], "^", color=colour, ms=3, mfc="none", mew=0.7)
     good &= np.isfinite(errors).all(axis=1)
     if good.any():
-        # The limits exclude outliers from view, so that these do not compress the rest.
+        # The limits exclude outliers, so that these do not compress the other points.
         limit = max(0.5, 1.3 * float(np.percentile(np.abs(errors[good]), 99)))
         ax.set_ylim(-limit, limit)
     if place.dtype.kind == "M":
@@ -214,7 +214,7 @@ def ellipses(
     Parameters
     ----------
     plane
-        To the right of and above the aim, (M, 2).
+        Positions to the right of and above the aim, (M, 2).
     covariance
         Covariance of each point, (M, 2, 2) or (2, 2), in the square of the unit; by default no
         ellipses.
@@ -266,7 +266,7 @@ def _draw_ellipses(ax: "Axes", points: FloatArray, covariance: npt.ArrayLike) ->
     known = np.isfinite(matrices).all(axis=(1, 2)) & np.isfinite(points).all(axis=1)
     for point, matrix in zip(points[known], matrices[known], strict=True):
         size, turn = np.linalg.eigh(matrix)
-        # Smallest first; the second column is the long axis.
+        # Eigenvalues are in ascending order, so the second column is the long axis.
         short, long = 2.0 * np.sqrt(CHI_SQUARE_90 * np.maximum(size, 0.0))
         angle = float(np.degrees(np.arctan2(turn[1, 1], turn[0, 1])))
         ax.add_patch(
@@ -281,7 +281,7 @@ def _draw_ellipses(ax: "Axes", points: FloatArray, covariance: npt.ArrayLike) ->
                 alpha=0.7,
             )
         )
-    # Patches alone do not widen the limits.
+    # Patches by themselves do not widen the limits.
     ax.autoscale_view()
 
 
@@ -295,15 +295,15 @@ def field_map(
     whole: bool = False,
     ax: "Axes | None" = None,
 ) -> "Axes":
-    """Draw a map of heliostats coloured by a value; grey where the value is NaN.
+    """Draw a map of heliostats coloured by a value; heliostats with NaN are grey.
 
     Parameters
     ----------
     position
         ENU metres, (N, 3) or (N, 2).
     values
-        One value per heliostat, (N,), in the unit of the label; the colour scale ends at the 95th
-        percentile.
+        One value per heliostat, (N,), in the unit stated in the label; the colour scale ends at the
+        95th percentile.
     label
         Meaning of the values, with their unit.
     names
@@ -421,7 +421,8 @@ def drift(
     names
         Names of the P parameters.
     shown
-        Parameters to draw, all with the same unit; by default all that have the unit of the first.
+        Parameters to draw, all with the same unit; by default all parameters that have the unit of
+        the first.
     ax
         Axes to draw on; by default new axes.
 
@@ -430,7 +431,7 @@ def drift(
     InputError
         If shapes do not fit, or units are mixed.
     UnknownNameError
-        If a name to draw is not among the parameters.
+        If a name in ``shown`` is not among the parameters.
     """
     dates = _dates(times)
     table, spread = as_numbers(values, "values"), as_numbers(covariance, "covariance")

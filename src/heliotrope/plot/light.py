@@ -1,4 +1,4 @@
-"""The flux of a field: receivers unrolled, and field and receiver in three dimensions."""
+"""Plot the flux of a field: unrolled receivers, and field and receivers in three dimensions."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Colours of flux and of efficiency.
+#: Colour maps of flux and of efficiency.
 _FLUX, _SHARE = "inferno", "cividis"
 #: Maximum number of heliostats drawn in three dimensions; in larger fields only every second,
 #: third, … is drawn.
@@ -57,7 +57,7 @@ def receiver_map(view: FluxView, *, ax: "Axes | None" = None) -> "Axes":
 
 
 def efficiency_map(found: PlantFlux, by: str = "total", *, ax: "Axes | None" = None) -> "Axes":
-    """Draw a map of the field coloured by an efficiency; grey where a beam cannot reach its aim.
+    """Draw a map of heliostats coloured by an efficiency; grey if the aim is out of reach.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def efficiency_map(found: PlantFlux, by: str = "total", *, ax: "Axes | None" = N
 
 
 def flux_3d(found: PlantFlux, by: str = "total", *, ax: "Any | None" = None) -> Any:
-    """Draw the field, coloured by an efficiency, with its receivers, coloured by their flux.
+    """Draw heliostats coloured by an efficiency, and receivers coloured by their flux.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def flux_3d(found: PlantFlux, by: str = "total", *, ax: "Any | None" = None) -> 
 
 
 def flux_figure(found: PlantFlux, by: str = "total") -> "Figure":
-    """Return one figure of the field's flux: map, first receiver unrolled, and a 3-D view."""
+    """Return a figure of the field's flux: map, first receiver unrolled, and a 3-D view."""
     import matplotlib.pyplot as plt
 
     figure = plt.figure(figsize=(13.0, 8.0), layout="constrained")
@@ -144,7 +144,7 @@ def flux_figure(found: PlantFlux, by: str = "total") -> "Figure":
 
 
 def aim_figure(plan: AimPlan) -> "Figure":
-    """Return a figure of a plan's flux, its quantile over the limit, and where the limit binds.
+    """Return a figure of a plan's flux, its quantile relative to the limit, and active limits.
 
     Parameters
     ----------

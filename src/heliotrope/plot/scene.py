@@ -1,4 +1,4 @@
-"""A mechanism in three dimensions, with a time slider."""
+"""Draw a mechanism in three dimensions, with a time slider."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from heliotrope.mechanism.chain import Mechanism
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-#: Length of the rays that are drawn, in widths of the mirror.
+#: Length of the rays that are drawn, in mirror widths.
 _RAY = 2.0
 
 
@@ -30,7 +30,7 @@ def mechanism_3d(
     title: str = "armature and mirror",
     figure: "Figure | None" = None,
 ) -> "Figure":
-    """Return a plotly figure: a heliostat's bones, axes and mirror, with a time slider.
+    """Return a plotly figure of a heliostat's links, axes and mirror, with a time slider.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def mechanism_3d(
     width, height
         Size of the mirror, m.
     labels
-        Names of the T times on the slider; default their indices.
+        Names of the T times on the slider; default: their indices.
     sun, aim
         Sun vectors, (T, 3), and the aim point, ENU m, (3,), whose rays are drawn.
     title
@@ -85,7 +85,7 @@ def mechanism_3d(
 
 
 def _layout(scene: Moving, names: Sequence[str], reach: float) -> dict[str, Any]:
-    """Return the axes to scale, the slider and the buttons."""
+    """Return the layout: axes to scale, the slider and the buttons."""
     steps = [
         {"label": name, "method": "animate", "args": [[name], {"mode": "immediate"}]}
         for name in names
@@ -120,7 +120,7 @@ def _traces(
     aim: FloatArray | None,
     reach: float,
 ) -> list[Any]:
-    """Return bones, axes, mirror, normal and rays of one moment."""
+    """Return the links, axes, mirror, normal and rays at one moment."""
 
     def line(points: FloatArray, colour: str, name: str, dash: str = "solid") -> Any:
         style = {"color": colour, "width": 6 if dash == "solid" else 3, "dash": dash}

@@ -1,9 +1,9 @@
 """Safety: the condition table and its evaluation, alarms, and confirmation of emergency orders.
 
-Begin with `CONDITIONS`, the rows of the table, and `evaluate`, which turns readings and time into
-the required actions. `Proof` records whether every heliostat obeyed an emergency order. `limited`
-returns the table with the limits that a plant sets for its site. `JoinLimiter` limits the rate at
-which heliostats join the receiver. `Alarm` is a message to operators, and
+Begin with `CONDITIONS`, the rows of the table, and `evaluate`, which determines the required
+actions from readings and the time. `Proof` records whether every heliostat obeyed an emergency
+order. `limited` returns the table with the limits that a plant sets for its site. `JoinLimiter`
+limits the rate at which heliostats join the receiver. `Alarm` is a message to operators, and
 `heliotrope.safety.alarms` lists every kind of alarm that is not a row of the table.
 
 No function in this package reads a clock, a sensor or a link.

@@ -21,8 +21,8 @@ class Alarm:
     Attributes
     ----------
     condition, subject
-        Name of the row or of the `AlarmKind`; the cluster, heliostat, target or sensor that the
-        alarm concerns, "" for the plant.
+        Name of the row or of the `AlarmKind`, and the cluster, heliostat, target or sensor that the
+        alarm concerns ("" for the plant).
     severity, text
         Severity, and text for the operator.
     active
@@ -46,15 +46,15 @@ class AlarmKind:
     name
         Name in messages and on the page.
     watcher
-        Control tier that raises it.
+        Control tier that raises the alarm.
     severity
         Usual severity.
     meaning
-        Circumstances in which it is raised.
+        Circumstances in which the alarm is raised.
     text
         What is wrong and where, with ``{subject}`` and other fields to fill in.
     consequence, remedy
-        What happens automatically, and what the operator should do: one sentence each.
+        What happens automatically, and what the operator should do, in one sentence each.
     over
         Text when the alarm has cleared; empty for an alarm that never clears by itself.
     worse

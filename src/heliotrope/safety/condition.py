@@ -6,7 +6,7 @@ from enum import Enum, IntEnum, StrEnum
 
 from heliotrope.errors import InputError
 
-#: A time of at least this represents an unknown time, s.
+#: A time of at least this value represents an unknown time, s.
 UNKNOWN_TIME = 1e8
 
 
@@ -36,7 +36,7 @@ _ACT_TEXTS = {
 
 
 class Scope(IntEnum):
-    """The part of the plant that an action applies to."""
+    """The part of the plant to which an action applies."""
 
     HELIOSTAT = 0
     CLUSTER = 1
@@ -44,7 +44,7 @@ class Scope(IntEnum):
 
 
 class Severity(StrEnum):
-    """Severity of an alarm or event; the same word in messages, in the store and on the page."""
+    """Severity of an alarm or event; messages, the store and the page use the same word."""
 
     INFO = "info"
     WARNING = "warning"
@@ -53,7 +53,7 @@ class Severity(StrEnum):
 
     @property
     def rank(self) -> int:
-        """Rank from 0, the least severe."""
+        """Rank of the severity, from 0 for the least severe."""
         return tuple(Severity).index(self)
 
     @classmethod
@@ -67,9 +67,9 @@ class Severity(StrEnum):
 
 
 class AcknowledgeRole(IntEnum):
-    """Role that is allowed to acknowledge; a higher role may acknowledge for a lower role.
+    """Role required to acknowledge an alarm; higher roles may acknowledge too.
 
-    The console's engineer acts as supervisor, and that title is displayed.
+    On the console, the engineer acts as supervisor and is displayed with that title.
     """
 
     OPERATOR = 0
@@ -91,7 +91,7 @@ class Watcher(Enum):
 
 @dataclass(frozen=True)
 class Reading:
-    """A value in the unit of its row, and the time of its measurement, monotonic s."""
+    """A value in the unit of its row, and the monotonic time of the measurement, s."""
 
     value: float
     at: float
@@ -106,18 +106,18 @@ class Condition:
     name
         Unique name.
     watcher
-        Control tier that evaluates it.
+        Control tier that evaluates the row.
     reading, unit
-        Key of the reading, and its unit: "s", "m/s", "rad", "°C", "share" (1 is 100 %), "count" or
-        "yes/no" (1 is yes).
+        Key of the reading, and unit of the reading: "s", "m/s", "rad", "°C", "share" (1 is 100 %),
+        "count" or "yes/no" (1 is yes).
     what, wrong
-        The reading as a noun; and what is wrong when the row trips, with ``{value}`` for the
+        The reading as a noun, and what is wrong when the row trips, with ``{value}`` for the
         reading.
     trips, releases
-        The row trips at ``trips`` or beyond, and may release at ``releases`` or on the safe side of
-        it. ``trips`` above ``releases`` means that high values are unsafe.
+        The row trips at ``trips`` or beyond, and may release at ``releases`` or on its safe side.
+        If ``trips`` is above ``releases``, high values are unsafe.
     act, scope, severity
-        The action, the part of the plant that it applies to, and the severity.
+        The action, the part of the plant to which it applies, and the severity.
     budget
         Maximum time from the fault to the completed action, s.
     then_stow
@@ -127,21 +127,22 @@ class Condition:
     delay
         Time for which the value must be beyond ``trips``, s.
     clear_for
-        Time for which fresh readings must be safe before release, s.
+        Time for which fresh readings must be safe before the row releases, s.
     stale_after
-        Age above which a reading counts as the worst case, s; not used with ``ages``.
+        Age above which a reading is replaced by the worst case, s; not used if ``ages`` is true.
     ages
-        Whether the reading is an age or a silence, which increases until the next reading.
+        Whether the reading is an age or the duration of a silence, which increases until the next
+        reading.
     role
         Role required to acknowledge; None if the row does not latch.
     waiver
-        Role that may release a non-latching row whose cause persists; None: nobody.
+        Role that may release a non-latching row whose cause persists; None if nobody may.
     release
-        Condition for its release, in words.
+        Condition for the release of the row, in words.
     remedy
-        What the operator should do: one sentence.
+        What the operator should do, in one sentence.
     site
-        Lowest and highest ``trips`` that a plant may set, in the unit of the reading; None: the
+        Lowest and highest ``trips`` that a plant may set, in the unit of the reading; None if the
         plant file may not change any limit of the row. See `limits`.
     """
 
@@ -209,7 +210,7 @@ class Condition:
 
     @property
     def detection(self) -> float:
-        """Maximum time from the fault to the trip, s, including loss of the reading itself."""
+        """Maximum time from the fault to the trip, s, even if the reading itself is lost."""
         return self.delay + (self.trips if self.ages else self.stale_after)
 
     @property
@@ -247,12 +248,12 @@ class Condition:
         return "" if self.unit in ("yes/no", "count") else f" (limit {self.shown(self.trips)})"
 
     def ordered(self, act: Act) -> str:
-        """Return an action by the name under which the plant may order it."""
+        """Return the name under which the plant may order an action."""
         return "DEFOCUS or STOW" if self.or_stow and act is Act.DEFOCUS else act.name
 
     @property
     def consequence(self) -> str:
-        """The automatic action: one sentence."""
+        """The automatic action, in one sentence."""
         target = {Scope.HELIOSTAT: "the heliostat", Scope.CLUSTER: "the cluster"}
         whole = target.get(self.scope, "the field")
         text = {

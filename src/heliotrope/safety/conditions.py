@@ -1,8 +1,8 @@
 """The rows of the safety table.
 
-The limits are defaults. A plant sets those of a row with ``site`` to suit its receiver, its
-heliostats and its weather (`limits`); the permitted ranges are our own. The wind limits are typical
-of heliostats of tens of square metres; replace them with the manufacturer's.
+The limits are defaults. If a row has ``site``, a plant may set its limits to suit its receiver,
+heliostats and weather (`limits`). The permitted ranges are our own. The wind limits are typical of
+heliostats of tens of square metres; replace them with the manufacturer's.
 """
 
 import math
@@ -16,17 +16,18 @@ _HELIOSTAT, _BUS, _FIELD = Scope
 _INFO, _WARNING, _SERIOUS, _EMERGENCY = Severity
 _OPERATOR, _SUPERVISOR = AcknowledgeRole
 
-#: Lease from the plant to a cluster, and from a cluster's sun vector to its local controllers, s.
+#: Duration of the plant's lease to a cluster, and of the lease that a cluster's sun vector gives
+#: its local controllers, s.
 PLANT_LEASE, SUN_LEASE = 3.0, 6.0
-#: Time from a defocus to STOW, unless the defocus is lifted, s.
+#: Time from a DEFOCUS to STOW, unless the DEFOCUS is lifted, s.
 _PATIENCE = 30.0
-#: The same if only a cluster is left. It knows no keep-out volumes, and its DEFOCUS may have turned
-#: a beam into one, where the beam must not stay for 30 s.
+#: The same time if only a cluster is left. A cluster does not know the keep-out volumes, and its
+#: DEFOCUS may have turned a beam into such a volume, where the beam must not stay for 30 s.
 _ALONE = 20.0
 
 
 def conditions(autonomy: float = 0.0) -> tuple[Condition, ...]:
-    """Return the table.
+    """Return the safety table.
 
     Parameters
     ----------
@@ -375,5 +376,5 @@ def _mirrors() -> tuple[Condition, ...]:
     )  # fmt: skip
 
 
-#: The table with autonomy 0.
+#: The safety table with autonomy 0.
 CONDITIONS = conditions()

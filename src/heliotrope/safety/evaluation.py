@@ -1,20 +1,20 @@
 """Evaluation of the safety table: a pure function of readings, state and time.
 
-The plant, the clusters and the local controllers each evaluate the rows that name them. A row
+The plant, the clusters and the local controllers each evaluate the rows assigned to them. A row
 defines the reading that trips it, the limit and the delay; the action, its scope and its severity;
 whether the row latches and which role must acknowledge it; and when it releases. This module reads
 no clock and no sensor: readings and time (monotonic seconds) are arguments.
 
 Rules for every row:
 
-- A reading that is missing, not finite or from the future is ignored. The last valid reading counts
-  until it is older than the age limit of the row; after that the worst case counts. A reading that
-  is itself an age (a silence) keeps increasing.
+- A reading that is missing, not finite or from the future is ignored. The last valid reading is
+  used until it is older than the age limit of the row; after that the worst case is assumed. A
+  reading that is itself an age (the duration of a silence) keeps increasing.
 - Only fresh readings release a row, so a frozen data stream never improves the situation.
 - A latched row stays tripped until its cause has gone *and* an operator with the row's role or a
   higher role acknowledges it. An acknowledgement before the cause has gone is refused.
-- The strongest action takes precedence. A released row moves no heliostat; motion needs a new
-  command.
+- The strongest action takes precedence. The release of a row does not move any heliostat; motion
+  needs a new command.
 """
 
 import math
@@ -40,20 +40,20 @@ Key = tuple[str, str]
 
 @dataclass(frozen=True)
 class Track:
-    """The memory of one row for one subject.
+    """What the evaluation remembers about one row for one subject.
 
     Attributes
     ----------
     value, seen
-        Last valid reading (``None`` before the first) and its time, s; before the first, the start
-        time.
+        Last valid reading and its time, s. Before the first reading, these are ``None`` and the
+        start time.
     beyond_since
-        Time at which the value went beyond the trip limit, s; None while it is not beyond it.
+        Time at which the value went beyond the trip limit, s; None while it is within the limit.
     safe_since
-        Time of the first in an unbroken series of safe readings, s; None if the last reading is not
-        safe.
+        Time at which the present unbroken series of safe readings began, s; None if the last
+        reading is not safe.
     tripped_at
-        Time at which the row tripped, s; None while it is not tripped.
+        Time at which the row tripped, s; None while the row is not tripped.
     cleared
         Whether the cause has gone and only the acknowledgement is missing.
     acknowledged_by
@@ -71,7 +71,7 @@ class Track:
 
 @dataclass(frozen=True)
 class SafetyState:
-    """The memory of the evaluation: rows, their tracks, and the time of the last evaluation, s."""
+    """State of the evaluation: rows, their tracks, and the time of the last evaluation, s."""
 
     table: tuple[Condition, ...]
     now: float
@@ -89,7 +89,7 @@ class Action:
     Attributes
     ----------
     act, scope, subject
-        The action and its scope; and the name of the cluster or heliostat, "" for the field.
+        The action, its scope, and the name of the cluster or heliostat ("" for the field).
     condition, severity, budget
         Name, severity and budget (s) of the row.
     since
@@ -97,9 +97,9 @@ class Action:
     new
         Whether the row tripped, or changed to STOW, in this evaluation.
     waits
-        Whether only an acknowledgement is missing.
+        Whether the row waits only for an acknowledgement.
     text, remedy
-        What is wrong and what happens automatically; and what the operator should do.
+        What is wrong and what happens automatically, and what the operator should do.
     """
 
     act: Act
@@ -130,10 +130,10 @@ def start(
     table
         The rows to evaluate, from `conditions` and `watched_by`.
     now
-        Monotonic seconds; the age of a reading that never arrives counts from this time.
+        Monotonic time, s. The age of a reading that never arrives is counted from this time.
     subjects
-        By name, for rows of scope CLUSTER or HELIOSTAT: the clusters or heliostats for which to
-        evaluate the row. Without subjects a row is evaluated once, for the subject "".
+        For rows of scope CLUSTER or HELIOSTAT, keyed by row name: the clusters or heliostats for
+        which to evaluate the row. Without subjects a row is evaluated once, for the subject "".
 
     Raises
     ------
@@ -158,9 +158,10 @@ def start(
 
 
 def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetyState:
-    """Return the state with a row evaluated for some subjects and those for which it has tripped.
+    """Return the state in which one row is evaluated only for some subjects.
 
-    For rows about heliostats, of which only a few ever need evaluation.
+    Subjects for which the row has already tripped are kept. This is meant for rows about
+    heliostats, of which only a few ever need evaluation.
 
     Parameters
     ----------
@@ -183,10 +184,10 @@ def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetySt
 
 
 def recalled(state: SafetyState, keys: Iterable[Key]) -> SafetyState:
-    """Return the state with rows tripped as before a restart, each with its subject.
+    """Return the state with rows tripped, each for its subject, as they were before a restart.
 
-    They release like all rows, through fresh readings and, where required, an acknowledgement. A
-    row that is no longer in the table is left out.
+    These rows release like all rows, through fresh readings and, where required, an
+    acknowledgement. A row that is no longer in the table is left out.
     """
     known = {row.name: row for row in state.table}
     tripped = {
@@ -205,13 +206,13 @@ def evaluate(
     Parameters
     ----------
     readings
-        By reading name and subject. A reading with subject "" is used for subjects that have no
-        reading of their own.
+        Readings, keyed by reading name and subject. A reading with the subject "" is used for
+        subjects that have no reading of their own.
     state
         State from `start` or from the last evaluation.
     now
-        Monotonic seconds. A time before the last evaluation indicates a faulty clock: a field-wide
-        DEFOCUS is required, and no row ages or releases.
+        Monotonic time, s. A time before the last evaluation indicates a faulty clock; a field-wide
+        DEFOCUS is then required, and no row ages or releases.
     """
     actions: list[Action] = []
     time = now
@@ -253,7 +254,7 @@ def _advance(row: Condition, track: Track, reading: Reading | None, now: float) 
     """Return the track advanced to ``now``, with or without a new reading."""
     value, read_at, fresh = track.value, track.seen, False
     if reading is not None and math.isfinite(reading.value) and read_at <= reading.at <= now:
-        # Of two readings with the same time, the worse one counts.
+        # Of two readings with the same time, the worse one is used.
         worse = value is None or (reading.value > value if row.above else reading.value < value)
         if reading.at > read_at or worse:
             value, read_at, fresh = reading.value, reading.at, True
@@ -271,7 +272,7 @@ def _advance(row: Condition, track: Track, reading: Reading | None, now: float) 
         tripped_at = now if tripped_at is None else tripped_at
         cleared, by = False, "" if track.tripped_at is None else by
     elif tripped_at is not None:
-        # Safe time counts up to the last reading only, so that silence releases nothing.
+        # Safe time is counted only up to the last reading, so that silence does not release a row.
         cleared = safe_since is not None and read_at - safe_since >= row.clear_for
         if cleared and not row.latched:
             tripped_at, cleared = None, False
@@ -279,7 +280,7 @@ def _advance(row: Condition, track: Track, reading: Reading | None, now: float) 
 
 
 def _counting(row: Condition, value: float | None, read_at: float, now: float) -> float:
-    """Return the value by which the row is judged now."""
+    """Return the value with which the row is evaluated now."""
     age = now - read_at
     if row.ages:
         return (0.0 if value is None else value) + age
@@ -332,7 +333,7 @@ def _act(row: Condition, tripped_for: float) -> Act:
 
 
 def _said(row: Condition, track: Track, now: float) -> str:
-    """Return, in words, the value by which the row is judged."""
+    """Return, in words, the value with which the row is evaluated."""
     counts = _counting(row, track.value, track.seen, now)
     if track.value is None and not row.ages and now - track.seen <= row.stale_after:
         return (
@@ -352,7 +353,7 @@ def _said(row: Condition, track: Track, now: float) -> str:
 
 
 def _strangers(readings: Mapping[Key, Reading], state: SafetyState, now: float) -> Iterable[Action]:
-    """Yield an alarm for each reading that no row uses: a misnamed reading monitors nothing."""
+    """Yield an alarm for each reading that no row uses, because its name may be misspelt."""
     known = {row.reading for row in state.table}
     kind = alarms.UNKNOWN_READING
     for name in sorted({name for name, _ in readings} - known):
@@ -374,7 +375,7 @@ def _strangers(readings: Mapping[Key, Reading], state: SafetyState, now: float) 
 def acknowledge(
     state: SafetyState, condition: str, who: str, role: AcknowledgeRole, subject: str = ""
 ) -> tuple[SafetyState, str | None]:
-    """Return the state after an operator's acknowledgement, and the reason if refused, or None.
+    """Return the state after an operator's acknowledgement, and the reason if it is refused.
 
     Parameters
     ----------
@@ -383,7 +384,7 @@ def acknowledge(
     condition, subject
         The row, and the cluster or heliostat that it concerns.
     who, role
-        The operator's name, for the record, and role.
+        Name of the operator, for the record, and role of the operator.
     """
     rows = {row.name: row for row in state.table}
     row, track = rows.get(condition), state.tracks.get((condition, subject))
@@ -408,7 +409,7 @@ def acknowledge(
 
 
 def _remains(row: Condition, track: Track, now: float) -> str:
-    """Return the refusal to acknowledge a row before its safe time has passed."""
+    """Return the reason why a row cannot be acknowledged before its safe time has passed."""
     if not row.safe(_counting(row, track.value, track.seen, now)):
         return f"the cause is not gone: {_said(row, track, now)}. {row.remedy}"
     safe = 0.0 if track.safe_since is None else track.seen - track.safe_since
@@ -419,7 +420,7 @@ def _remains(row: Condition, track: Track, now: float) -> str:
 
 
 def decision(actions: Iterable[Action], cluster: str = "", heliostat: str = "") -> Act | None:
-    """Return the strongest action that applies to a heliostat in a cluster; None if none does.
+    """Return the strongest action that applies to a heliostat in a cluster; None if there is none.
 
     An action without a subject applies to everything that the evaluating tier commands.
     """

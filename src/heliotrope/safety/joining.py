@@ -10,7 +10,7 @@ from heliotrope.errors import InputError
 class JoinLimiter:
     """A limit on the rate at which heliostats join the receiver.
 
-    In any span of T seconds at most ``burst + rate · T`` heliostats join.
+    In any period of T seconds, at most ``burst + rate · T`` heliostats join.
 
     Attributes
     ----------
@@ -19,7 +19,8 @@ class JoinLimiter:
     burst
         Number of heliostats that may join at once after a pause, an integer of at least 1.
     tokens, at
-        Number of heliostats that may join at the monotonic time ``at``, s. A new limiter is empty.
+        Number of heliostats that may join at the monotonic time ``at``, s. A new limiter admits
+        none yet.
     """
 
     rate: float
@@ -40,8 +41,8 @@ class JoinLimiter:
     def admit(self, wanted: int, now: float) -> tuple["JoinLimiter", int]:
         """Return the updated limiter, and how many of ``wanted`` heliostats may join now.
 
-        A clock that stops, runs backwards or is not a number grants no tokens; a clock that jumps
-        ahead fills the bucket at most to its burst size.
+        If the clock stops, runs backwards or returns NaN, no heliostat is admitted. If it jumps
+        ahead, at most ``burst`` heliostats are admitted.
         """
         at = self.at
         tokens = self.tokens

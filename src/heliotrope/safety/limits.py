@@ -1,10 +1,10 @@
-"""Site limits: the limits of the safety table that a plant sets for itself.
+"""Site limits: the limits of the safety table that a plant may set for itself.
 
-A plant file, or for its own rows a cluster file, sets limits by condition, with the unit in each
-key: ``[safety.wind_gust_stow] trips_m_s = 18``. `limited` checks them and returns the table with
-these limits. A limit that would weaken an invariant (how soon a fault is detected, how soon a beam
-is off) is rejected, and so is every limit of a row that depends on leases or on operator orders
-(`Condition.site` is None).
+A plant file sets limits by condition, with the unit in each key; a cluster file may do so for the
+rows that the cluster evaluates. An example is ``[safety.wind_gust_stow] trips_m_s = 18``. `limited`
+checks them and returns the table with these limits. A limit is rejected if it would weaken an
+invariant, such as how soon a fault is detected or how soon a beam is off the receiver. Limits of
+rows that depend on leases or on operator orders are also rejected (`Condition.site` is None).
 """
 
 import math
@@ -16,9 +16,10 @@ from typing import Any
 from heliotrope.errors import InputError
 from heliotrope.safety.condition import Act, Condition
 
-#: Limits by condition and key, as in a file.
+#: Limits, keyed by condition and then by key, as in a file.
 Limits = Mapping[str, Mapping[str, float]]
-#: Suffixes of the keys of `trips` and `releases`, by the unit of the reading, and their size in it.
+#: For each unit of a reading: the suffixes of the keys of `trips` and `releases`, and the size of
+#: their units in that unit.
 _UNITS: dict[str, dict[str, float]] = {
     "s": {"_s": 1.0},
     "m/s": {"_m_s": 1.0},
@@ -32,16 +33,16 @@ _UNITS: dict[str, dict[str, float]] = {
 _SAFEST = {"share": 1.0, "rad": math.pi / 4.0, "°C": 40.0}
 #: Angles below this are shown in mrad, rad.
 _SMALL = 0.05
-#: Shortest and longest value of a time key, s. A ``then_stow`` longer than the row's own is refused
-#: too.
+#: Smallest and largest value of a time key, s. A ``then_stow`` longer than that of the row is also
+#: rejected.
 _TIMES = {
     "delay": (0.0, 60.0),
     "clear_for": (2.0, 86400.0),
     "stale_after": (1.0, 60.0),
     "then_stow": (0.0, 120.0),
 }
-#: Latest time from a fault until a row with this act trips, s. This leaves 20 s of the 30 s of a
-#: DEFOCUS for the motion, and 270 s of the 300 s of a STOW.
+#: Longest permitted time from a fault until a row with this action trips, s. This leaves 20 s of
+#: the 30 s of a DEFOCUS for the motion, and 270 s of the 300 s of a STOW.
 NOTICED = {Act.DEFOCUS: 10.0, Act.STOW: 30.0}
 
 
@@ -52,13 +53,13 @@ class Setting:
     Attributes
     ----------
     key, number
-        Key in a file, with its unit; field of `Condition`.
+        Key in a file, with its unit, and the corresponding field of `Condition`.
     size
-        Size of the file's unit in the unit of the field.
+        Size of the unit used in the file, in the unit of the field.
     low, high
-        Permitted range, in the file's unit.
+        Permitted range, in the unit used in the file.
     main
-        False for a second unit of the same limit.
+        Whether this is the main key of the limit; False for a key with a second unit.
     """
 
     key: str
@@ -69,12 +70,12 @@ class Setting:
     main: bool = True
 
     def shown(self, row: Condition) -> float:
-        """Return the row's limit in the file's unit."""
+        """Return the row's limit in the unit used in the file."""
         return float(f"{getattr(row, self.number) / self.size:.9g}")
 
 
 def settings_of(row: Condition) -> dict[str, Setting]:
-    """Return the limits of a row that a plant may set, by key; empty if the row has no range."""
+    """Return the limits of a row that a plant may set, by key; empty if none may be set."""
     if row.site is None:
         return {}
     settings: list[Setting] = []
@@ -82,7 +83,7 @@ def settings_of(row: Condition) -> dict[str, Setting]:
         # Small angles are easiest to read in mrad, elevations in degrees.
         main = row.unit != "rad" or (row.site[1] < _SMALL) == (end == "_mrad")
         low, high = (float(f"{value / size:.4g}") for value in row.site)
-        # The release lies on the safe side of the trip.
+        # The release limit is on the safe side of the trip limit.
         free = (0.0, high) if row.above else (low, float(f"{_SAFEST[row.unit] / size:.4g}"))
         settings += [
             Setting(f"trips{end}", "trips", size, low, high, main),
@@ -126,7 +127,7 @@ def numbers(table: Iterable[Condition]) -> dict[str, float]:
 
 
 def differences(before: Mapping[str, float], after: Mapping[str, float]) -> list[str]:
-    """Return the differences between two results of `numbers`, one line each: old, then new."""
+    """Return the differences between two results of `numbers`, one line each, old before new."""
     return [
         f"{key}: {before[key]:g} → {value:g}"
         for key, value in after.items()
@@ -209,7 +210,7 @@ def _changed(row: Condition, row_limits: Mapping[str, float]) -> Condition:
 
 
 def _ordered(row: Condition, rows: Iterable[Condition]) -> None:
-    """Refuse a weaker act that follows a stronger act for the same reading."""
+    """Reject a weaker action that would trip after a stronger action for the same reading."""
     for other in rows:
         if other.reading != row.reading or other.act == row.act:
             continue

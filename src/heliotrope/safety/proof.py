@@ -1,8 +1,9 @@
 """Confirmation that an emergency order was carried out.
 
-It is based on reports, that is, on states and step counts. The only quantity measured after the
-order is the flux on the receiver, if a sensor supplies it; the flux reflects the whole field, not a
-single heliostat. Earlier evidence that mirrors follow their drives is reported alongside.
+The confirmation is based on reports, that is, on states and step counts. The only quantity measured
+after the order is the flux on the receiver, if a sensor supplies it; the flux reflects the whole
+field, not a single heliostat. Earlier evidence that mirrors follow their drives is included in the
+report.
 """
 
 import math
@@ -14,30 +15,30 @@ from enum import Enum
 from heliotrope.errors import InputError
 from heliotrope.safety.condition import Reading
 
-#: Maximum time from the order to the last acknowledgement, to beams off the receiver, and to stow,
-#: s.
+#: Maximum time from the order to the last acknowledgement, until all beams are off the receiver,
+#: and until all heliostats are stowed, s.
 ORDER_BUDGET, DEFOCUS_BUDGET, STOW_BUDGET = 1.0, 30.0, 300.0
 #: Limit of the flux on the receiver after a defocus, as a fraction of the nominal flux.
 FLUX_LIMIT = 0.10
-#: A flux reading older than this (s) proves nothing.
+#: A flux reading older than this, s, does not confirm anything.
 FLUX_AGE = 5.0
 #: Sensor of the flux on the receiver, as a fraction of its nominal value.
 FLUX_READING = "receiver_flux_nominal"
 
 
 class FluxProof(Enum):
-    """What is known about the flux on the receiver; the value is the display text."""
+    """What is known about the flux on the receiver; each value is the text to display."""
 
-    #: No sensor supplies it, so the confirmation rests on what each heliostat reports.
+    #: No sensor supplies the flux, so the confirmation rests on what each heliostat reports.
     NOT_MEASURED = "the flux on the receiver is not measured"
-    #: There is still time for a reading.
+    #: No reading has confirmed it yet, but there is still time for one.
     AWAITED = "flux not proven yet"
     #: A fresh reading, taken after the order, is below the limit.
     BELOW = (
         "measured: the flux is below its limit "
         f"({FLUX_LIMIT:.0%} of nominal, where single beams do not show)"
     )
-    #: No such reading arrived in time.
+    #: No reading below the limit arrived in time.
     NOT_BELOW = f"flux not proven to be below {FLUX_LIMIT:.0%}"
 
 
@@ -58,10 +59,11 @@ class ProofReport:
         Whether every heliostat has acknowledged and completed the order, and the flux is confirmed
         or not measured.
     unknown
-        What is known about each heliostat whose completion nothing can confirm.
+        What is known about each heliostat for which nothing can confirm that it carried out the
+        order.
     followed
-        Number of heliostats that have completed the order and whose mirrors were observed to follow
-        their drives earlier today, by kind of evidence.
+        For each kind of evidence, the number of heliostats that have completed the order and whose
+        mirrors were observed earlier today to follow their drives.
     believed
         Heliostats whose completion rests on their own reports alone, sorted.
     """
@@ -106,7 +108,7 @@ class ProofReport:
         return f"{self.evidence}{names}"
 
     def with_evidence(self, done: Iterable[str], shown: Mapping[str, str]) -> "ProofReport":
-        """Return the report with today's evidence that mirrors follow their drives, by heliostat.
+        """Return the report with today's evidence, by heliostat, that mirrors follow their drives.
 
         ``done`` are the heliostats that have carried out the order.
         """
@@ -125,14 +127,14 @@ def _first(names: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True)
 class Proof:
-    """The record of one DEFOCUS or STOW order, which names every heliostat that has not obeyed.
+    """Record of one DEFOCUS or STOW order that shows which heliostats have not obeyed.
 
     Attributes
     ----------
     order
         "DEFOCUS" or "STOW".
     ordered_at
-        Monotonic s.
+        Time of the order, monotonic s.
     nodes
         Heliostats that must obey.
     acknowledged, done
@@ -142,7 +144,8 @@ class Proof:
     flux_measured
         Whether a sensor supplies the flux.
     refused
-        Number of reports that confirm nothing: from other heliostats, or from before the order.
+        Number of reports that confirm nothing, because they are from other heliostats or from
+        before the order.
     """
 
     order: str
@@ -195,7 +198,7 @@ class Proof:
         )
 
     def without(self, nodes: Iterable[str]) -> "Proof":
-        """Return the record after revoking the completion of some heliostats."""
+        """Return the record after withdrawing the completion reports of some heliostats."""
         undone = frozenset(nodes)
         return replace(self, done={n: at for n, at in self.done.items() if n not in undone})
 
@@ -240,12 +243,12 @@ class Proof:
 
 
 def proof_readings(proof: Proof | None, now: float) -> dict[tuple[str, str], Reading]:
-    """Return the safety-table readings derived from a proof; None: no emergency.
+    """Return the safety-table readings that an emergency order's record implies.
 
-    ``nodes_unacknowledged`` is 0 until the acknowledgement deadline, then the number of heliostats
-    that have not acknowledged. ``flux_after_emergency`` is 0 until the defocus deadline, then the
-    flux as a fraction of the nominal flux, or 1 if its sensor is silent; it stays 0 if no sensor
-    supplies it.
+    ``proof`` is None if there is no emergency. ``nodes_unacknowledged`` is 0 until the
+    acknowledgement deadline, then the number of heliostats that have not acknowledged.
+    ``flux_after_emergency`` is 0 until the defocus deadline, then the flux as a fraction of the
+    nominal flux, or 1 if its sensor is silent; it stays 0 if no sensor supplies it.
     """
     silent, flux = 0.0, 0.0
     if proof is not None:

@@ -1,9 +1,10 @@
 """The sun: its position as angles and as a vector, and sunrise and sunset.
 
-Begin with `vector` (or `position` for the angles); `events` and `daylight` return the times of a
-day. These functions accept any number of times, in any form that `unix_seconds` reads.
-`vector_and_rate`, `fast_vector` and `broadcast_values` follow the sun at one site second by second,
-as cluster controllers broadcast it. `clear_sky` estimates the direct irradiance.
+Begin with `vector` (or `position` for the angles); `events` returns the sunrise and sunset of a
+day, and `daylight` the times at which the sun is up. These functions accept any number of times, in
+any form that `unix_seconds` reads. `vector_and_rate`, `fast_vector` and `broadcast_values` return
+the sun vector at one site second by second, as cluster controllers broadcast it. `clear_sky`
+estimates the direct irradiance.
 """
 
 from heliotrope.sun.broadcast import (

@@ -1,6 +1,6 @@
 """The sun vector at one site, second by second, as cluster controllers broadcast it.
 
-SPA is evaluated every 10 s and interpolated by a cubic. With four knots 10 s apart the
+SPA is evaluated every 10 s and interpolated with a cubic polynomial. With four knots 10 s apart the
 interpolation error is (ωh)⁴·3/128, less than 1e-13 (ω = 7.3e-5 rad/s); refraction near the horizon
 changes faster and adds less than a nanoradian. All clusters of one site within a process share the
 knots.
@@ -20,8 +20,8 @@ _BLOCK = 60
 _UNIT, _RATE = float(1 << 30), float(1 << 28)
 _LARGEST_RATE = 32767
 
-#: Upward component of the sun vector below which no vector is broadcast. SPA's apparent sun jumps
-#: by 10 mrad at -0.0045, and a local controller rejects any below -0.02.
+#: No sun vector is broadcast if its upward component is below this. SPA's apparent sun jumps by 10
+#: mrad at -0.0045, and a local controller rejects any vector below -0.02.
 LOWEST_BROADCAST = -0.003
 
 Vector = tuple[float, float, float]
@@ -29,7 +29,7 @@ Vector = tuple[float, float, float]
 
 @functools.lru_cache(maxsize=64)
 def _knots(site: Site, block: int) -> tuple[Vector, ...]:
-    """Directions to the apparent sun from one step before a block to two after it."""
+    """Return directions to the apparent sun from one step before a block to two after it."""
     steps = np.arange(-1.0, _BLOCK + 2.0) + block * _BLOCK
     return tuple((float(e), float(n), float(u)) for e, n, u in vector(steps * STEP, site))
 
@@ -50,7 +50,7 @@ def vector_and_rate(utc_s: float, site: Site) -> tuple[Vector, Vector]:
     block = step // _BLOCK
     first = step - block * _BLOCK
     knots = _knots(site, block)[first : first + 4]
-    # Lagrange's weights at -1, 0, 1, 2, and their derivatives.
+    # Lagrange interpolation weights for the knots -1, 0, 1, 2, and their derivatives.
     v, w, x = u + 1.0, u - 1.0, u - 2.0
     weights = (-u * w * x / 6.0, v * w * x / 2.0, -v * u * x / 2.0, v * u * w / 6.0)
     slopes = (
@@ -74,12 +74,12 @@ def _combined(weights: tuple[float, ...], knots: tuple[Vector, ...], divisor: fl
 def fast_vector(utc_s: float, site: Site) -> FloatArray:
     """Return the unit vector to the apparent sun, ENU, (3,), from `vector_and_rate`."""
     direction, _ = vector_and_rate(utc_s, site)
-    # No cubic can follow the jump below the horizon.
+    # A cubic polynomial cannot follow the jump below the horizon.
     return vector(utc_s, site) if direction[2] < 0.0 else np.array(direction)
 
 
 def broadcast_values(second: int, utc_s: float, site: Site) -> tuple[int, ...] | None:
-    """Return the fields of a SUN message, or None while the sun is below `LOWEST_BROADCAST`.
+    """Return the fields of a SUN message; None while the sun is below `LOWEST_BROADCAST`.
 
     Parameters
     ----------

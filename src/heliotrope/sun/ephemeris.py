@@ -38,17 +38,17 @@ Times: TypeAlias = datetime | Sequence[datetime] | npt.ArrayLike
 #: of solar radius below the horizon, so that the upper limb touches the horizon.
 UPPER_LIMB = float(np.radians(-0.8333))
 
-# SPA switches refraction off where the sun's centre stands lower than this, in degrees.
+# SPA omits refraction if the sun's centre is lower than this, in degrees.
 _HORIZON_REFRACTION_DEG = 0.5667
 _LOWEST_REFRACTED_DEG = -(0.26667 + _HORIZON_REFRACTION_DEG)
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _DAY = 86400.0
-_FIRST_YEAR, _LAST_YEAR = -2000, 6000  # validity of SPA
+_FIRST_YEAR, _LAST_YEAR = -2000, 6000  # Years in which SPA is valid.
 #: Times from here on are outside SPA's validity, Unix seconds.
 END_OF_TIMES = float(np.datetime64(f"{_LAST_YEAR + 1}", "s").astype(np.int64))
-_FIRST_DELTA_T, _LAST_DELTA_T = -1999, 3000  # validity of pvlib's polynomials of ΔT
-# pvlib holds some twenty intermediate arrays at a time; at 3 MB per chunk they stay in the cache.
+_FIRST_DELTA_T, _LAST_DELTA_T = -1999, 3000  # Years in which pvlib's ΔT polynomials are valid.
+# pvlib keeps some twenty intermediate arrays at a time; with 3 MB per chunk they stay in the cache.
 _CHUNK = 16384
 
 
@@ -66,14 +66,14 @@ class Site:
         Height above the ellipsoid in m, −500 to 9000.
     pressure
         Air pressure at the site (not reduced to sea level) in Pa, 30,000 to 120,000;
-        None takes the standard atmosphere at ``height``.
+        None for the standard atmosphere at ``height``.
     temperature_c
         Air temperature in °C, −90 to 60.
     name
         Display name; nothing depends on it.
     delta_t
-        TT − UT1 in s, −8000 to 8000; None takes pvlib's polynomials by year and month (Espenak &
-        Meeus), which were 5 s too high in 2025, an error of 1 µrad in sun position.
+        TT − UT1 in s, −8000 to 8000; None for pvlib's polynomials by year and month (Espenak &
+        Meeus). These were 5 s too high in 2025, which causes an error of 1 µrad in sun position.
 
     Raises
     ------
@@ -117,7 +117,7 @@ class Site:
 
     @property
     def origin(self) -> tuple[float, float, float]:
-        """Latitude and longitude in degrees and height in m: the origin of ENU frames."""
+        """Latitude and longitude in degrees, and height in m, of the origin of ENU frames."""
         return self.latitude_deg, self.longitude_deg, self.height
 
     @property
@@ -131,12 +131,12 @@ class Site:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """Latitude and longitude, °; height, m; pressure, Pa (−1: from the height); air, °C."""
+        """Latitude and longitude, °; height, m; pressure, Pa (−1 if unset); air temperature, °C."""
         pressure = -1.0 if self.pressure is None else self.pressure
         return (self.latitude_deg, self.longitude_deg, self.height, pressure, self.temperature_c)
 
 
-#: Names that `position` takes for its algorithm.
+#: Algorithm names that `position` accepts.
 ALGORITHMS = ("spa", "grena2008")
 
 _SITE_LIMITS = (
@@ -215,16 +215,16 @@ class SunEvents:
     Attributes
     ----------
     sunrise, sunset
-        None where the sun does not cross the given elevation: both are None in a polar night, and
-        at least one on a polar day (the first and the last polar day of the season have one
-        crossing).
+        Times of sunrise and sunset; None if the sun does not cross the given elevation. In a polar
+        night both are None. On a polar day at least one is None (the first and the last polar day
+        of the season have one crossing).
     culmination
         Time of the sun's upper transit of the meridian.
     culmination_elevation
         Apparent elevation at culmination, rad.
     kind
-        "polar night": the sun culminates below the given elevation; "normal": it rises and sets;
-        "polar day": any other case.
+        "polar night" if the sun culminates below the given elevation, "normal" if it rises and
+        sets, or "polar day" in any other case.
     """
 
     sunrise: datetime | None
@@ -244,8 +244,9 @@ def position(times: Times, site: Site, *, algorithm: str = "spa") -> SunPosition
     site
         Location, pressure and temperature.
     algorithm
-        "spa"; or "grena2008", the algorithm that Malan used, as a cross-check for the years 2003 to
-        2022: ±0.0027° (47 µrad) according to its author, confirmed against SPA.
+        "spa", or "grena2008" for the algorithm that Malan used, as a cross-check for the years 2003
+        to 2022. The accuracy of the latter is ±0.0027° (47 µrad) according to its author, which was
+        confirmed against SPA.
 
     Raises
     ------
@@ -259,10 +260,11 @@ def position(times: Times, site: Site, *, algorithm: str = "spa") -> SunPosition
 
     Notes
     -----
-    Source: Reda & Andreas (2004), equations 4 to 47; refraction follows their equation 42 with the
-    pressure and temperature of the site. Accuracy: ±5 µrad (0.0003°) according to the authors, ±5
-    µrad against IAU 2006/2000A (ERFA) for 2020 to 2035, excluding refraction and UT1 − UTC (below
-    0.9 s, 65 µrad). Refraction close to the horizon varies with the weather by more than 1 mrad.
+    The source is Reda & Andreas (2004), equations 4 to 47; refraction follows their equation 42
+    with the pressure and temperature of the site. The accuracy is ±5 µrad (0.0003°) according to
+    the authors. Compared with IAU 2006/2000A (ERFA) for 2020 to 2035 it is also ±5 µrad, excluding
+    refraction and UT1 − UTC (below 0.9 s, 65 µrad). Refraction close to the horizon varies with the
+    weather by more than 1 mrad.
     """
     if algorithm not in ALGORITHMS:
         raise UnknownNameError("sun algorithm", str(algorithm), ALGORITHMS)
@@ -327,16 +329,16 @@ def events(
 
     Notes
     -----
-    At sunrise and sunset `position` returns the requested elevation to 0.1 µrad, which is 2 ms
-    where the sun climbs by 11° an hour. Because refraction varies with the weather, the time of a
-    real sunrise is uncertain by a minute.
+    At sunrise and sunset `position` returns the requested elevation to 0.1 µrad, which corresponds
+    to 2 ms where the sun climbs by 11° per hour. Because refraction varies with the weather, the
+    time of a real sunrise is uncertain by a minute.
     """
     from scipy.interpolate import CubicSpline
 
     noon = _mean_noon(day, site)
     level = float(np.sin(_true_level(elevation, site) if apparent else _checked(elevation)))
-    # The components of the true vector are nearly sinusoids of the day. A cubic spline
-    # through 10-minute nodes follows them to (ωh)⁴/384 = 1e-8.
+    # The components of the true vector are nearly sinusoids with a period of one day. A cubic
+    # spline through 10-minute nodes reproduces them to (ωh)⁴/384 = 1e-8.
     offsets = np.arange(-13 * 3600.0, 13 * 3600.0 + 1.0, 600.0)
     sun = vector(noon + offsets, site, apparent=False)
     meridian = CubicSpline(offsets, sun[:, 0]).roots(extrapolate=False)
@@ -362,10 +364,10 @@ def events(
 
 
 def solar_day(time: datetime, site: Site) -> date:
-    """Return the day in local mean solar time that an aware time falls on.
+    """Return the day, in local mean solar time, on which an aware time falls.
 
-    This is the day that people at the site call today, whatever the zone of ``time``; a California
-    afternoon, for example, may already be tomorrow in UTC.
+    This is the day that is called today at the site, whatever the zone of ``time``. For example, an
+    afternoon in California may already be tomorrow in UTC.
 
     Raises
     ------
@@ -426,10 +428,10 @@ def daylight(
 
 
 def _spa(seconds: FloatArray, site: Site) -> FloatArray:
-    """Azimuth, apparent and true elevation in degrees, shape (3, n), of n unix times.
+    """Return azimuth, apparent and true elevation in degrees, (3, n), at n Unix times.
 
-    Chunks have fixed borders, so memory is bounded (340 MB for a million times in one
-    piece) and the outcome cannot depend on the number of threads.
+    The times are processed in chunks with fixed borders. This limits memory (a million times at
+    once would take 340 MB) and makes the result independent of the number of threads.
     """
     from pvlib import spa
 
@@ -455,7 +457,7 @@ def _spa(seconds: FloatArray, site: Site) -> FloatArray:
 
 
 def _grena(seconds: FloatArray, site: Site) -> FloatArray:
-    """Azimuth, apparent and true elevation by Grena, rad, shape (3, n), of n unix times."""
+    """Return Grena's azimuth, apparent and true elevation, rad, (3, n), at n Unix times."""
     out = (seconds < grena.FIRST) | (seconds >= grena.LAST)
     if out.any():
         raise InputError(
@@ -514,15 +516,15 @@ def _true_level(apparent: float, site: Site) -> float:
         )
         return true + float(refraction) - target
 
-    # In dense, cold air the apparent elevation jumps past 0 where refraction sets in.
+    # In dense, cold air the apparent elevation jumps past 0 where refraction begins.
     if excess(_LOWEST_REFRACTED_DEG) >= 0.0:
         return float(np.radians(_LOWEST_REFRACTED_DEG))
-    # The refraction of SPA is slightly negative at the zenith, hence the margin.
+    # The margin is needed because SPA's refraction is slightly negative at the zenith.
     return float(np.radians(brentq(excess, _LOWEST_REFRACTED_DEG, target + 0.001)))
 
 
 def _number(value: object) -> float:
-    """Return a number as a float; anything else becomes NaN, which no range holds."""
+    """Return a number as a float; anything else becomes NaN, which is outside every range."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return np.nan
     return float(value)
@@ -537,7 +539,7 @@ def _checked(elevation: float, name: str = "elevation") -> float:
 
 
 def _mean_noon(day: Any, site: Site) -> float:
-    """Return local mean solar noon in unix seconds: 4 minutes later a degree westwards."""
+    """Return local mean solar noon in Unix seconds, which is 4 min later per degree west."""
     if isinstance(day, str):
         try:
             day = date.fromisoformat(day)
@@ -557,19 +559,19 @@ def _utc(seconds: float) -> datetime:
 
 
 def unix_seconds(times: Times, *, unknown: bool = False) -> FloatArray:
-    """Return times as Unix seconds (UTC) of the same shape; every time is read here.
+    """Return times as Unix seconds (UTC) of the same shape; all functions read times with this.
 
     Parameters
     ----------
     times
-        Of any shape (...); see `Times`. Numbers are Unix seconds (UTC).
+        Times of any shape (...); see `Times`. Numbers are Unix seconds (UTC).
     unknown
         Whether NaN may stand for an unknown time; NaT is never accepted.
 
     Raises
     ------
     TimeError
-        If a value is not a time, or has no time zone; the message gives its position.
+        If a value is not a time, or has no time zone; the message states the position of the value.
     """
     if isinstance(times, np.ndarray) and times.dtype.kind == "f":
         seconds = as_float(times)  # without loading pandas
@@ -579,7 +581,7 @@ def unix_seconds(times: Times, *, unknown: bool = False) -> FloatArray:
     for index in np.argwhere(invalid)[:1]:
         value = np.asarray(times, dtype=object)[tuple(index)]
         raise _no_time(value, index)
-    # Milliseconds of our time are tens of thousands of years away.
+    # Times in milliseconds, taken for seconds, would be tens of thousands of years away.
     _refuse_outside(
         seconds, _FIRST_YEAR, _LAST_YEAR, "the validity of SPA; numbers are unix seconds"
     )
@@ -594,7 +596,7 @@ def _no_time(value: Any, index: Sequence[int]) -> TimeError:
 
 
 def _seconds_of(times: Times) -> FloatArray:
-    """Return unix seconds, NaN where a number or a missing one is not finite."""
+    """Return Unix seconds; NaN for a value that is missing or not finite."""
     import pandas as pd
 
     if isinstance(times, pd.Series | pd.Index) and isinstance(times.dtype, pd.DatetimeTZDtype):
@@ -619,7 +621,7 @@ def _seconds_of(times: Times) -> FloatArray:
 
 
 def _one_time(value: Any, index: Sequence[int]) -> float:
-    """Return unix seconds; NaN only for a NaN."""
+    """Return Unix seconds; NaN only if the value is NaN."""
     import pandas as pd
 
     time = value
@@ -649,7 +651,7 @@ def _label(index: Sequence[int]) -> str:
 
 
 def _check_years(seconds: FloatArray, site: Site) -> None:
-    """Refuse times outside the validity of ΔT; those outside that of SPA are no times."""
+    """Reject times for which ΔT is unknown, unless the site states its own ΔT."""
     if site.delta_t is None:
         _refuse_outside(
             seconds, _FIRST_DELTA_T, _LAST_DELTA_T, "the known ΔT; pass Site(delta_t=...) in s"

@@ -1,24 +1,24 @@
-"""Grena's 2008 algorithm, which Malan used: a cross-check of the sun position for 2003 to 2022.
+"""Grena's 2008 algorithm, which Malan used, as a cross-check of the sun position, 2003 to 2022.
 
-Source: R. Grena, "An algorithm for the computation of the solar position", Solar Energy 82 (2008)
-462-470. The paper itself was not available; the constants are those of the program printed in it,
-which two public reprints reproduce identically. A test confirms the author's accuracy, 0.0027°,
-against SPA over all twenty years.
+The source is R. Grena, "An algorithm for the computation of the solar position", Solar Energy 82
+(2008) 462-470. The paper itself was not available. The constants are those of the program printed
+in it, which two public reprints reproduce identically. A test confirms the author's accuracy,
+0.0027°, against SPA over all twenty years.
 """
 
 import numpy as np
 
 from heliotrope.geometry import FloatArray, as_float
 
-#: First moment of his validity, 2003-01-01, and first moment after it, 2023-01-01, unix seconds.
+#: Start (2003-01-01) and end (2023-01-01, excluded) of the algorithm's validity, Unix seconds.
 FIRST, LAST = 1_041_379_200.0, 1_672_531_200.0
 
-#: Unix time of his epoch, Julian day 2452640 (2002-12-31, noon), s.
+#: Unix time of Grena's epoch, Julian day 2452640 (2002-12-31, noon), s.
 _EPOCH = 1_041_336_000.0
 _DAY = 86400.0
-#: Below this true elevation he leaves refraction out, rad.
+#: Below this true elevation Grena omits refraction, rad.
 _LOWEST_REFRACTED = -0.01
-#: Sun's parallax as he rounds it, rad.
+#: The sun's parallax as rounded by Grena, rad.
 _PARALLAX = 4.26e-5
 
 
@@ -35,11 +35,11 @@ def grena2008(
     Parameters
     ----------
     seconds
-        Unix times, n of them, from `FIRST` to `LAST`.
+        Unix times from `FIRST` to `LAST`, (n,).
     latitude, longitude
-        Rad, north and east positive.
+        Latitude and longitude, rad, positive to the north and to the east.
     pressure_atm, temperature_c
-        Of the air, atmospheres and °C.
+        Pressure, atmospheres, and temperature, °C, of the air.
     delta_t
         TT − UT1, s, (n,).
     """
@@ -52,7 +52,7 @@ def grena2008(
     declination = np.arcsin(np.sin(obliquity) * np.sin(ecliptic))
     hour = 6.30038809903 * universal + 4.8824623 + 0.9174 * nutation + longitude - ascension
     across, along = np.cos(latitude), np.sin(latitude)
-    # From the earth's centre to the place.
+    # Convert from the earth's centre to the site (parallax).
     shift = -_PARALLAX * across * np.sin(hour)
     declination = declination - _PARALLAX * (along - declination * across)
     cosine = np.cos(hour) + shift * np.sin(hour)
@@ -60,7 +60,7 @@ def grena2008(
     true = np.arcsin(along * np.sin(declination) + across * np.cos(declination) * cosine)
     azimuth = np.pi + np.arctan2(sine, cosine * along - np.tan(declination) * across)
     refracted = true > _LOWEST_REFRACTED
-    # Held at its limit below it, where the tangent may pass through 0.
+    # The elevation is held at the limit below it, where the tangent may pass through 0.
     e = np.maximum(true, _LOWEST_REFRACTED)
     refraction = 0.084217 * pressure_atm / (273.0 + temperature_c)
     refraction = refraction / np.tan(e + 0.0031376 / (e + 0.089186))
@@ -68,7 +68,7 @@ def grena2008(
 
 
 def _heliocentric_longitude(t: FloatArray) -> FloatArray:
-    """Return the earth's heliocentric longitude, rad: line, ellipse, moon, planets, remainder."""
+    """Return the sum of all terms of the earth's heliocentric longitude, rad."""
     year = 1.72019e-2 * t - 0.0563
     longitude = 1.740940 + 1.7202768683e-2 * t + 3.34118e-2 * np.sin(year)
     longitude = longitude + 3.488e-4 * np.sin(2.0 * year)

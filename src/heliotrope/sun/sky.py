@@ -2,15 +2,16 @@
 
 import numpy as np
 
-#: Irradiance above the atmosphere with which the formula was fitted, W/m².
+#: Irradiance above the atmosphere for which the formula was fitted, W/m².
 _OUTSIDE = 1353.0
 
 
 def clear_sky(elevation: float, altitude: float) -> float:
-    """Return the direct normal irradiance under a clear sky, W/m²; 0 with the sun down.
+    """Return the direct normal irradiance under a clear sky, W/m²; 0 if the sun is down.
 
-    Meinel's fit to measurements with its term for altitude, and Kasten and Young's air mass, both
-    as on https://www.pveducation.org (Air Mass; Calculation of Solar Insolation).
+    The result is Meinel's fit to measurements, including its term for altitude, with Kasten and
+    Young's air mass. Both are as stated on https://www.pveducation.org (Air Mass; Calculation of
+    Solar Insolation).
 
     Parameters
     ----------

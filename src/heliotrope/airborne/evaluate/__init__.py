@@ -1,6 +1,6 @@
-"""Evaluation of a drone's photographs: mirror orientations, report and sightings.
+"""Evaluate a drone's photographs: mirror orientations, report and sightings.
 
-Begin with `evaluate_flight`, which processes a folder of photographs to the result; its docstring
+Begin with `evaluate_flight`, which turns a folder of photographs into the result; its docstring
 lists the steps. `write_result` writes the result to files. Each step can also be called separately:
 `read_many`, `evaluate`, `measure_field`, `to_sightings`.
 """

@@ -1,24 +1,24 @@
 r"""The error budget of an orientation: its systematic part, and the part that averages out.
 
 An error in the lines of sight from a point to the lamp and the camera rotates the measured normal
-of that point. Let s and t be the unit vectors from the mirror to the two, v their bisector, and δ
-the displacement of the mirror relative to the drone. Then
+of that point. Let s and t be the unit vectors from the mirror to the lamp and to the camera, v
+their bisector, and δ the displacement of the mirror relative to the drone. Then
 
 $$ δv = -\frac{I - v v^T}{|s + t|}
 \left(\frac{I - s s^T}{d_s} + \frac{I - t t^T}{d_t}\right) δ $$
 
-which, with the lamp beside the camera, is the component of δ across the line of sight divided by
-the distance. An error common to all points of a mirror rotates its orientation by that amount,
-however many points there are:
+With the lamp beside the camera, this is the component of δ across the line of sight, divided by the
+distance. An error common to all points of a mirror rotates the measured orientation by that amount,
+however many points there are. Such errors are
 
 - the surveyed position of the heliostat,
 - its kinematics, that is, the vertex in this pose compared with the model,
 - the absolute position of the RTK base, unless it was estimated from the heliostats themselves,
-- the offset of the lamp from the camera, which affects only one of the two lines.
+- the offset of the lamp from the camera, which affects only one of the two lines of sight.
 
-Errors that differ from point to point average out, and appear in the scatter of the differences:
-the detected position of the reflection on the mirror, the RTK error of each photograph, and the
-slope deviations if no map is known.
+Errors that differ from point to point average out, and appear in the scatter of the differences.
+They are errors in the detected position of the reflection on the mirror, the RTK error of each
+photograph, and the slope deviations if there is no slope map.
 """
 
 from dataclasses import dataclass, fields
@@ -39,9 +39,11 @@ class Budget:
     position
         Surveyed position of the heliostat.
     kinematics
-        Vertex in a pose, relative to the surveyed position and the nominal mechanism.
+        Position of the vertex in one pose, compared with the surveyed position and the nominal
+        mechanism.
     rtk
-        Common offset of all drone positions; its remainder if it was estimated from the heliostats.
+        Common offset of all drone positions, or what remains of it if the offset was estimated from
+        the heliostats.
     lamp
         Offset of the lamp from the camera.
     """
@@ -58,13 +60,13 @@ class Budget:
                 raise InputError(f"budget: {f.name} must be 0 or more, not {value} m")
 
     def parts(self, distance: npt.ArrayLike) -> dict[str, FloatArray]:
-        """Return the rotation caused by each error at distances (...), rad per axis, (...)."""
+        """Return the rotation that each error causes at distances (...), rad per axis, (...)."""
         d = as_float(distance)
         return {
             "position": self.position / d,
             "kinematics": self.kinematics / d,
             "rtk": self.rtk / d,
-            # The lamp is at one of the two ends.
+            # The lamp is at only one of the two ends.
             "lamp": 0.5 * self.lamp / d,
         }
 
@@ -80,7 +82,7 @@ class Budget:
         axes: npt.ArrayLike,
         place: npt.ArrayLike | None = None,
     ) -> FloatArray:
-        """Return the covariance along two axes of the error common to N points, (2, 2), rad².
+        """Return the covariance, along two axes, of the error common to N points, rad², (2, 2).
 
         Parameters
         ----------
@@ -113,8 +115,9 @@ def lever(
 
     Returns
     -------
-    Derivatives along the axes with respect to ENU metres, (N, 2, 3) each. Moving the mirror is
-    equivalent to moving both the opposite way.
+    Derivatives of the normals along the axes with respect to the displacement in ENU metres, (N, 2,
+    3) each. Moving the mirror is equivalent to moving both the lamp and the camera the opposite
+    way.
     """
     m, across = as_vectors(point, "point"), as_float(axes)
     parts, total = [], np.zeros_like(m)

@@ -9,18 +9,18 @@ recorded position p at
 
 $$ X = (R e^{[φ]})^T (v + d + δ + M e^{[ψ]} (c + g c) - (p - b + t)) $$
 
-in camera axes, at (X/Z, Y/Z) without distortion. Without g, a shadow along the edges of all mirrors
-that shifts the edges by a tenth of a pixel would move the camera by a decimetre, because mirrors
-that look smaller would be assumed to be farther away.
+in camera axes, at (X/Z, Y/Z) without distortion. The unknown g is needed because a shadow along the
+edges of all mirrors may shift the edges by a tenth of a pixel. Mirrors that look smaller would then
+be assumed to be farther away, which would move the camera by a decimetre.
 
-Seen from one place only, a shift of all mirrors is absorbed by the camera attitude, and survey
-errors leave an error in b of several times their mean. Views from several sides separate the two,
-so flights over the same heliostats go into one adjustment.
+If the mirrors are seen from one place only, the camera attitude absorbs a shift of all mirrors, and
+survey errors leave an error in b of several times their mean. Views from several sides separate
+survey errors from b, so flights over the same heliostats go into one adjustment.
 
-All unknowns have priors: the stated RTK deviation, that of the survey and that of the commands; the
-prior of φ is wide. The normal equations (Gauss-Newton, with Huber weights beyond 2.5 standard
-deviations) are sparse and are solved as such by SuperLU, which also provides the covariances; a
-least-squares driver without the normal matrix would not.
+All unknowns have priors: the stated standard deviations of RTK, survey and commands; the prior of φ
+is wide. The normal equations (Gauss-Newton, with Huber weights beyond 2.5 standard deviations) are
+sparse and are solved by SuperLU, which also provides the covariances. A least-squares solver that
+does not form the normal matrix would not provide them.
 
 Derivatives, with [X]_× for the matrix of the cross product:
 $∂X/∂φ = [X]_×$, $∂X/∂t = -R^T = -∂X/∂b$, $∂X/∂δ = ∂X/∂d = R^T$,
@@ -42,12 +42,12 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_array
     from scipy.sparse.linalg import SuperLU
 
-#: Residuals beyond this many standard deviations weigh less.
+#: Residuals beyond this many standard deviations receive less weight.
 HUBER = 2.5
 _MOST_ROUNDS = 25
 #: With more photographs than this, the standard deviations of their positions are not computed.
 MOST_POSITIONS = 400
-#: Steps below this no longer matter, m and rad.
+#: Smaller steps than this no longer matter, m and rad.
 _STILL = 2e-6
 #: Narrowest prior of a position, m.
 _FIRM = 1e-6
@@ -106,22 +106,22 @@ class Priors:
 
 @dataclass(frozen=True)
 class State:
-    """The unknowns, and the values they start from.
+    """The unknowns, and the values from which the adjustment starts.
 
     Attributes
     ----------
     recorded
         Recorded positions, ENU m, (P, 3).
     rotation
-        Camera axes to ENU, (P, 3, 3).
+        Rotation from camera axes to ENU, (P, 3, 3).
     error
-        t of each position, m, (P, 3).
+        Error t of each position, m, (P, 3).
     offset
-        b, recorded minus true, m, (3,).
+        Common offset b, recorded minus true, m, (3,).
     stand
         Poses of the mirrors.
     survey
-        d of each heliostat's position, m, (H, 3); zeros if it was flown in one pose.
+        Error d of each heliostat's position, m, (H, 3); zeros if all were flown in a single pose.
     """
 
     recorded: FloatArray
@@ -144,9 +144,9 @@ class _Layout:
     Attributes
     ----------
     photos, mirrors, heliostats
-        Counts; no heliostats if each was flown in one pose.
+        Numbers of photographs, mirrors and heliostats; 0 heliostats if each was flown in one pose.
     owner
-        Row of each mirror's heliostat, (N,).
+        Index of each mirror's heliostat, (N,).
     """
 
     photos: int
@@ -193,15 +193,16 @@ class Adjusted:
         Standard deviations of the positions, m, (P, 3); NaN beyond `MOST_POSITIONS`.
     place_covariance
         Covariance of each mirror's position relative to the mean position of the photographs that
-        show it, m², (N, 3, 3): shared by all its reflections.
+        show it, m², (N, 3, 3). All reflections on the mirror share this error.
     common_covariance
-        Part of ``place_covariance`` common to all mirrors, that of their mean position, m², (3, 3).
+        Part of ``place_covariance`` that is common to all mirrors, namely that of their mean
+        position, m², (3, 3).
     residual
         Residuals of the corners, in standard deviations, (K, 2).
     deviation
-        Their RMS without outliers; 1 if the given standard deviations are right.
+        RMS of the residuals without outliers; 1 if the stated standard deviations are right.
     outlier
-        Corners beyond four standard deviations, (K,).
+        Mask of the corners beyond four standard deviations, (K,).
     rounds
         Number of iterations.
     converged
@@ -223,12 +224,12 @@ class Adjusted:
 def residuals(
     state: State, corners: Corners, *, derivative: bool = True
 ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-    """Return observed minus expected coordinates (K, 2), and derivatives of the latter.
+    """Return observed minus expected coordinates (K, 2), and derivatives of the expected ones.
 
     Returns
     -------
-    Residuals, and ∂place/∂φ, ∂t, ∂b, ∂δ, ∂ψ, (K, 2, 3) each, and ∂g, (K, 2, 2); derivatives only on
-    request.
+    Residuals, and ∂place/∂φ, ∂t, ∂b, ∂δ, ∂ψ, (K, 2, 3) each, and ∂g, (K, 2, 2); the derivatives are
+    computed only if requested.
     """
     R = state.rotation[corners.photo]
     M = state.stand.rotation[corners.mirror]
@@ -265,17 +266,18 @@ def adjust(
     Parameters
     ----------
     recorded, sigma
-        Recorded positions and their standard deviations without the common part, ENU m, (P, 3).
+        Recorded positions, and their standard deviations without the common part, ENU m, (P, 3).
     rotations
         Initial attitudes, accurate to a few mrad, (P, 3, 3).
     stand
-        Mirrors as surveyed and commanded, once for each pose.
+        Mirrors as surveyed and commanded, one entry per pose.
     corners
-        Corners seen.
+        Mirror corners seen in the photographs.
     priors
         Prior standard deviations; by default those of `Priors`.
     owner
-        Row of each mirror's heliostat, (N,); by default each mirror has its own.
+        Index of each mirror's heliostat, (N,); by default each mirror belongs to a different
+        heliostat.
 
     Raises
     ------
@@ -300,7 +302,7 @@ def adjust(
     for rounds in range(1, _MOST_ROUNDS + 1):
         gap, parts = residuals(state, corners)
         scaled = np.linalg.norm(gap, axis=-1) / corners.sigma
-        # In the first round a poor start may make all residuals large: no outliers yet.
+        # In the first round a poor start may make all residuals large, so none is an outlier yet.
         limit = HUBER if rounds > 1 else max(HUBER, 3.0 * float(np.median(scaled)))
         scale = np.sqrt(np.minimum(1.0, limit / np.maximum(scaled, 1e-9))) / corners.sigma
         prior, pull = _priors(layout, state, spreads, known, moved)
@@ -310,7 +312,7 @@ def adjust(
         if np.abs(step).max() < _STILL:
             converged = True
             break
-    assert solver is not None  # there is at least one round
+    assert solver is not None  # There is at least one round.
     return _result(layout, state, corners, solver, rounds, converged)
 
 
@@ -344,9 +346,10 @@ def _result(
 def _place_covariances(
     layout: _Layout, corners: Corners, solver: "SuperLU"
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance of d + δ + b minus the mean t of a mirror's photographs, (N, 3, 3).
+    """Return the covariance of d + δ + b minus the mean t of each mirror's photographs, (N, 3, 3).
 
-    The second result is the covariance of its mean over all mirrors that were seen, (3, 3).
+    The second result is the covariance of the mean of this quantity over all mirrors that were
+    seen, (3, 3).
     """
     unit = np.eye(3)
     covariances = np.empty((layout.mirrors, 3, 3))
@@ -414,7 +417,7 @@ def _normal_equations(
 def jacobian_matrix(
     corners: Corners, parts: tuple[FloatArray, ...], layout: _Layout
 ) -> "csc_array":
-    """Return the sparse derivative of all coordinates by all U unknowns, (2K, U)."""
+    """Return the sparse derivative of all coordinates with respect to all U unknowns, (2K, U)."""
     from scipy.sparse import csc_array
 
     count = len(corners)
@@ -456,7 +459,7 @@ def _step(
         stand=replace(
             start,
             vertex=start.vertex + total[:, :3] + survey[layout.owner],
-            # ψ is small, and its prior refers to the start.
+            # ψ is small, and its prior refers to the starting pose.
             rotation=start.rotation @ _turns(total[:, 3:6]),
             outline=start.outline * (1.0 + np.pad(total[:, None, 6:], ((0, 0), (0, 0), (0, 1)))),
         ),

@@ -1,8 +1,9 @@
 """Flights over the same heliostats in different poses, evaluated together.
 
 The survey errors of the heliostats and the common RTK offset are the same in all flights. Images
-from a single position can hardly separate the two (`heliotrope.airborne.evaluate.bundle`), so
-flights that share heliostats go through one adjustment, in groups that fit into memory.
+from a single position can hardly separate survey errors from the offset
+(`heliotrope.airborne.evaluate.bundle`), so flights that share heliostats are adjusted together, in
+groups that fit into memory.
 """
 
 from collections import Counter
@@ -20,7 +21,7 @@ from heliotrope.airborne.standing import join_standing
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
 
-#: Most corners in one adjustment: it takes 20 s and 0.4 GB for each hundred thousand.
+#: Maximum number of corners in one adjustment, which takes 20 s and 0.4 GB per 100,000 corners.
 MOST_CORNERS = 200_000
 
 
@@ -31,13 +32,13 @@ class Campaign:
     Attributes
     ----------
     flights
-        Results in the order given; None for a flight without a result.
+        Results in the order of the flights passed; None for a flight without a result.
     problems
-        For each flight, a message for each photograph that was not used, or why the flight has no
-        result.
+        For each flight, a message for each photograph that was not used, or the reason why the
+        flight has no result.
     offset, offset_covariance
-        Common RTK offset, recorded minus true, m, (3,), and its covariance, m², (3, 3): mean of all
-        groups, weighted by their accuracy.
+        Common RTK offset, recorded minus true, m, (3,), and its covariance, m², (3, 3); a mean over
+        all groups, weighted by their accuracy.
     groups
         Number of adjustments.
     """
@@ -62,7 +63,7 @@ class Campaign:
         return f"common RTK offset, recorded minus true: {', '.join(parts)} mm"
 
     def warnings(self, prior: float) -> list[str]:
-        """Return a warning if the offset is far larger than its prior standard deviation, m."""
+        """Return a warning if the offset far exceeds its prior standard deviation, m."""
         size = float(np.abs(self.offset).max())
         if size <= 3.0 * prior:
             return []
@@ -91,7 +92,7 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
     """
     evaluations: list[FlightEvaluation | None] = [None] * len(flights)
     problems = [tuple(flight.unused()) for flight in flights]
-    # The error of a single flight is raised as it is.
+    # The error of a single flight is raised unchanged.
     usable = [k for k, f in enumerate(flights) if f.corners or f.dark or len(flights) == 1]
     done = []
     for group in flight_groups(flights, usable):
@@ -123,7 +124,7 @@ def _cause(lines: Sequence[str]) -> str:
     reasons = [line for line in lines if line.strip(" :")]
     if not reasons:
         return "its photographs show no reflection of the lamp"
-    # A line of a photograph is "name: kind: reason".
+    # The message about a photograph has the form "name: kind: reason".
     kinds = Counter(line.partition(": ")[2].partition(":")[0] or line for line in reasons)
     kind, count = kinds.most_common(1)[0]
     line = next(text for text in reasons if kind in text)
@@ -131,7 +132,7 @@ def _cause(lines: Sequence[str]) -> str:
 
 
 def flight_groups(flights: Sequence[FlightData], usable: Sequence[int]) -> list[list[int]]:
-    """Return flights that share heliostats and camera, in groups of `MOST_CORNERS`."""
+    """Return groups of flights that share heliostats and camera, within `MOST_CORNERS`."""
     groups = [[k] for k in usable if flights[k].dark]
     remaining = [k for k in usable if not flights[k].dark]
     while remaining:
@@ -220,9 +221,9 @@ def _parts(flights: Sequence[FlightData], joint: FlightEvaluation) -> list[Fligh
 
 
 def common_offset(done: Sequence[FlightEvaluation], prior: float) -> tuple[FloatArray, FloatArray]:
-    """Return the groups' mean offset weighted by accuracy, m, and its covariance, m².
+    """Return the mean offset of all groups, weighted by accuracy, m, and its covariance, m².
 
-    The prior, of standard deviation ``prior``, counts once.
+    The prior, with standard deviation ``prior``, is counted only once.
     """
     own = np.eye(3) / prior**2
     weight, drawn = own, np.zeros(3)

@@ -1,4 +1,4 @@
-"""Detection of coded targets in photographs: numbers by OpenCV, corners by edge fits."""
+"""Detect coded targets in photographs; OpenCV reads the numbers, edge fits locate the corners."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from heliotrope.airborne.photo import LedCamera, Photo
 from heliotrope.errors import HeliotropeError
 from heliotrope.geometry import FloatArray, as_float
 
-#: Shortest side of a target, px: across its black border, an edge's profile must fit.
+#: Shortest side of a target, px; the profile of an edge must fit across its black border.
 SMALLEST = 24.0
-#: Largest distance of an edge from where OpenCV put it, px, first and then.
+#: Largest distance of an edge from where OpenCV located it, px, in the first and in the second fit.
 _REACHES = (2.0, 1.0)
-#: Corner error beyond that of the edges, px.
+#: Corner error in addition to that of the edges, px.
 _FLOOR = 0.03
 
 
@@ -33,7 +33,7 @@ class SeenTargets:
     sigma
         Standard deviation of a corner in each direction, px, (T,).
     problem
-        Why there are no targets; empty if there are some.
+        Why there are no targets; an empty string if there are some.
     """
 
     number: npt.NDArray[np.intp]
@@ -43,7 +43,7 @@ class SeenTargets:
 
 
 def find_targets(picture: Picture) -> SeenTargets:
-    """Return the targets in a picture, blue-green-red."""
+    """Return the targets in a picture with the channels blue, green, red."""
     import cv2
 
     finder = cv2.aruco.ArucoDetector(
@@ -54,7 +54,7 @@ def find_targets(picture: Picture) -> SeenTargets:
         return _none("there is no coded target in it")
     corners = as_float(np.stack(squares)).reshape(-1, 4, 2)
     number = np.asarray(numbers, dtype=np.intp).reshape(-1)
-    # If a number is read twice, one of the targets is false, and there is no telling which.
+    # If a number is read twice, one of the two targets is false, and it is unknown which.
     once = np.bincount(number, minlength=NUMBERS)[number] == 1
     large = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).min(axis=1) >= SMALLEST
     number, corners = number[once & large], corners[once & large]
@@ -72,7 +72,7 @@ def find_targets(picture: Picture) -> SeenTargets:
 
 
 def read_targets(photos: Sequence[Photo], camera: LedCamera) -> tuple[SeenTargets, ...]:
-    """Return the targets in the files of photographs, in their order."""
+    """Return the targets in the files of photographs, in the order of the photographs."""
     return tuple(_read(photo, camera) for photo in photos)
 
 

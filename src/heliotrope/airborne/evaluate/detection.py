@@ -1,4 +1,4 @@
-"""Detection in one photograph: mirrors as bright patches, their outlines, lamp reflections.
+"""Detect mirrors (as bright patches), their outlines and lamp reflections in a photograph.
 
 Pixel values are converted to light by the inverse of the sRGB curve before anything is measured;
 otherwise edges and spots would be displaced.
@@ -23,27 +23,29 @@ Rows = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 Light = npt.NDArray[np.float32]
 
-#: Readings of this and more are clipped.
+#: Readings of this value or more are clipped.
 CLIPPED = 253
-#: Quantiles of brightness taken as that of a mirror.
+#: Quantiles of brightness that are taken as the brightness of a mirror.
 _FILLED = (0.995, 0.9995, 0.97)
-#: Share of an edge left out at each end, profiles across it, and points measured on it.
+#: Fraction of an edge left out at each end, number of profiles across the edge, and number of
+#: points measured on it.
 _ENDS, _PROFILES, _GROUPS = 0.1, 32, 8
-#: An edge is drawn no closer than this to its true place, px.
+#: A drawn edge may be this far from its true position, px.
 _UNSURE = 1.5
-#: Of the three groups nearest a corner, as many must be seen.
+#: At least this many of the three groups nearest to a corner must be seen.
 _NEAR_CORNER = 2
-#: A spot exceeds its mirror by this many standard deviations of the noise, and by this share
-#: of full scale.
+#: A spot exceeds its mirror by this many standard deviations of the noise, and by this fraction of
+#: full scale.
 _SPOT_SIGMAS, _SPOT_LEAST = 7.0, 0.02
-#: The lamp exceeds its mirror by this share of the mirror's light; where gaps of 0.4 px between
-#: facets cross, a tenth of the light around is missing.
+#: The lamp exceeds its mirror by this fraction of the mirror's light. Where gaps of 0.4 px between
+#: facets cross, a tenth of the surrounding light is missing.
 _LAMP = 0.15
 #: Most of a spot's light lies this close to its centre, px.
 _REACH = 3.0
-#: How far beside a mirror brighter light is looked for, px.
+#: Brighter light is searched for up to this far beside a mirror, px.
 _BESIDE = 4
-#: Half the side of the window in which a spot is measured, and the width of its weight, px.
+#: Half the side of the window in which a spot is measured, and the width of the Gaussian weight,
+#: px.
 _WINDOW, _WEIGHT = 5, 1.8
 
 
@@ -69,7 +71,7 @@ class Outlines:
     sigma
         Standard deviation of a corner in each direction, px, (M,).
     contrast
-        Contrast of the weakest edge, share of full scale, (M,).
+        Contrast of the weakest edge, as a fraction of full scale, (M,).
     known
         Whether both edges of a corner were found, (M, 4).
     """
@@ -87,7 +89,7 @@ class Outlines:
 
 @dataclass(frozen=True)
 class Overlap:
-    """The mirror, of M, that each pixel of a photograph shows where mirrors overlap.
+    """Which of M overlapping mirrors each pixel of a photograph shows.
 
     Attributes
     ----------
@@ -101,9 +103,10 @@ class Overlap:
     own: Rows
 
     def clear(self, places: FloatArray, steps: FloatArray) -> Mask:
-        """Return the mask of edge profiles, (M, 4, P), that run from their mirror to the ground.
+        """Return a mask of the edge profiles, (M, 4, P), that run from their mirror to the ground.
 
-        ``places`` are pixels, (M, 4, P, S, 2); ``steps`` the S distances from the edge, px.
+        ``places`` are pixel positions, (M, 4, P, S, 2), and ``steps`` the S distances from the
+        edge, px.
         """
         height, width = self.labels.shape
         x = np.clip(np.round(places[..., 0]), 0, width - 1).astype(np.intp)
@@ -127,7 +130,7 @@ class Spots:
     sigma
         Standard deviation of the centre in each direction, px, (S,).
     flux
-        Light above the mirror's, full scale times pixels, (S,).
+        Light in excess of the mirror's, full scale times pixels, (S,).
     clipped
         Number of clipped pixels, (S,).
     """
@@ -143,12 +146,12 @@ class Spots:
 
 
 def decode(path: str | Path) -> Picture:
-    """Return a photograph, blue-green-red, (H, W, 3), in the sensor's rows and columns.
+    """Return a photograph in the rows and columns of the sensor, blue-green-red, (H, W, 3).
 
     Raises
     ------
     FormatError
-        If there is no file, it is truncated or damaged, or above the limits of
+        If there is no such file, or it is truncated, damaged, or above the limits of
         `heliotrope.files.limits`.
     """
     import cv2
@@ -162,7 +165,7 @@ def decode(path: str | Path) -> Picture:
         ) from None
     if data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:]:
         raise FormatError(file, f"the file ends after {len(data)} bytes; copy it again")
-    # Its header says how much memory decoding takes.
+    # The header says how much memory the decoded picture takes.
     read_metadata(file)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
@@ -182,7 +185,7 @@ def _linear() -> npt.NDArray[np.float32]:
 
 
 def brightness(picture: Picture, scale: float) -> tuple[Light, Light]:
-    """Return the light of a picture reduced by ``scale``, and its fraction of blue."""
+    """Return the light of a picture reduced by the factor ``scale``, and its fraction of blue."""
     import cv2
 
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -196,10 +199,10 @@ def find_patches(picture: Picture, expected: float) -> tuple[Patches, ...]:
     """Return patches of about ``expected`` px² that differ from their surroundings.
 
     Mirrors show the sky, so they are brighter than the ground, or at least bluer. The fraction of
-    the frame that they fill is unknown, so several sets are returned, the most likely first:
-    brighter patches for mirrors that fill more than 0.5 %, 0.05 % and 3 %, then bluer patches.
-    Darker patches are not searched for, because they are shadows, which are arranged like the
-    mirrors.
+    the frame that they fill is unknown, so several sets are returned, the most likely first. They
+    contain brighter patches for mirrors that fill more than 0.5 %, 0.05 % and 3 %, then bluer
+    patches. Darker patches are not searched for, because they are shadows, which are arranged like
+    the mirrors.
     """
     import cv2
 
@@ -208,7 +211,8 @@ def find_patches(picture: Picture, expected: float) -> tuple[Patches, ...]:
     answers = []
     for feature in brightness(picture, scale):
         above = np.clip(feature - cv2.blur(feature, (side, side)), 0.0, None)
-        # A quantile rather than the maximum: the lamp is brighter than any mirror, but small.
+        # A quantile is used rather than the maximum, because the lamp is brighter than any mirror,
+        # but small.
         for top in np.quantile(above, _FILLED):
             levels = np.clip(above * (255.0 / max(float(top), 1e-6)), 0.0, 255.0)
             _, mask = cv2.threshold(
@@ -242,7 +246,7 @@ def _whole_patches(mask: npt.NDArray[np.uint8], expected: float) -> Patches:
 
 
 def sample(picture: Picture, places: FloatArray) -> FloatArray:
-    """Return the light at pixels (..., 2), bilinear, (..., 3); outside, the light of the border."""
+    """Interpolate the light at pixels (..., 2) bilinearly; outside the picture, use its border."""
     height, width = picture.shape[:2]
     x = np.clip(places[..., 0], 0.0, width - 1.001).ravel()
     y = np.clip(places[..., 1], 0.0, height - 1.001).ravel()
@@ -264,9 +268,9 @@ def find_outlines(
     *,
     printed: bool = False,
 ) -> Outlines:
-    """Return the outlines of mirrors near the expected ones.
+    """Return the outlines of mirrors near the expected outlines.
 
-    Profiles across each edge are projected onto the colour in which both sides differ most and
+    Profiles across each edge are projected onto the colour in which the two sides differ most, and
     averaged in eight groups, each of which yields a position on the edge
     (`heliotrope.airborne.evaluate.edges`). A straight line is fitted through these positions with
     weights that reject outliers, such as a neighbour or a shadow.
@@ -280,9 +284,9 @@ def find_outlines(
     reach
         Largest distance of an edge from the expected one, px.
     profiles
-        Number of profiles across each edge, a multiple of eight; fewer are faster.
+        Number of profiles across each edge, a multiple of eight; a smaller number is faster.
     shown
-        What each pixel shows, if mirrors overlap; only edges against the ground are then measured.
+        What each pixel shows, if mirrors overlap. Only edges against the ground are then measured.
     printed
         Whether the outlines are squares printed on paper, which have no shadow beside them.
     """
@@ -295,7 +299,7 @@ def find_outlines(
     length = np.linalg.norm(along, axis=-1, keepdims=True)
     unit = along / np.maximum(length, 1e-9)
     outward = np.stack([unit[..., 1], -unit[..., 0]], axis=-1)
-    # Corners may run either way: outward is away from the middle.
+    # Corners may run clockwise or anticlockwise, so outward means away from the middle.
     middle = expected.mean(axis=1, keepdims=True)
     side = np.sum((0.5 * (start + end) - middle) * outward, axis=-1, keepdims=True)
     outward = outward * np.sign(side)
@@ -314,10 +318,10 @@ def find_outlines(
     points = points + offset[..., None] * outward[:, :, None]
     lines, spread, enough = _lines(points, known, outward)
     corners = _crossings(lines)
-    # At its ends, the error of a line is about twice that in its middle.
+    # At the ends of a line, the error is about twice that in its middle.
     count = np.maximum(enough.sum(axis=1), 1)
     sigma = np.sqrt(np.sum(np.where(enough, spread**2, 0.0), axis=1) / count) * 2.0
-    # The corner between an edge and the one before it: the end of that, the start of this.
+    # A corner is the end of the previous edge and the start of this edge.
     start_seen = known[..., :3].sum(axis=-1) >= _NEAR_CORNER
     end_seen = np.roll(known[..., -3:].sum(axis=-1) >= _NEAR_CORNER, 1, axis=1)
     both = enough & np.roll(enough, 1, axis=1) & np.isfinite(corners).all(axis=-1)
@@ -328,7 +332,7 @@ def find_outlines(
 def _lines(
     points: FloatArray, known: Mask, outward: FloatArray
 ) -> tuple[FloatArray, FloatArray, Mask]:
-    """Return lines a x + b y = c, (M, 4, 3), their errors, and which have enough points."""
+    """Return lines a x + b y = c, (M, 4, 3), their errors, and a mask of the valid lines."""
     weight = known.astype(np.float64)
     enough = weight.sum(axis=-1) >= 4
     weight = np.where(enough[..., None], weight, 1.0)
@@ -355,7 +359,7 @@ def _lines(
 
 
 def _crossings(lines: FloatArray) -> FloatArray:
-    """Return the intersection of each edge's line with the line of the edge before, (M, 4, 2)."""
+    """Return the intersection of each edge's line with that of the previous edge, (M, 4, 2)."""
     before = np.roll(lines, 1, axis=1)
     det = before[..., 0] * lines[..., 1] - before[..., 1] * lines[..., 0]
     det = np.where(np.abs(det) < 0.05, np.nan, det)
@@ -370,7 +374,7 @@ def _crossings(lines: FloatArray) -> FloatArray:
 def find_spots(
     picture: Picture, corners: FloatArray, most: int = 12, shown: Overlap | None = None
 ) -> tuple[Spots, tuple[str, ...]]:
-    """Return the lamp's spots on mirrors, and why each mirror shows none ("" if it does).
+    """Return the lamp's spots on mirrors, and for each mirror why it has none ("" if it has some).
 
     Parameters
     ----------
@@ -404,7 +408,7 @@ def find_spots(
 def _spots_of(
     picture: Picture, outline: FloatArray, shown: Overlap | None, k: int
 ) -> tuple[list[tuple[FloatArray, float, float, int]], str]:
-    """Return centre, sigma, flux and clipped pixels of a mirror's spots, or why it has none."""
+    """Return the centre, sigma, flux and clipped pixels of a mirror's spots, or why it has none."""
     import cv2
 
     tall, width = picture.shape[:2]
@@ -420,13 +424,14 @@ def _spots_of(
         label = shown.labels[low[1] : high[1], low[0] : high[0]]
         inside &= label == shown.own[k]
         other = ((label > 0) & (label != shown.own[k])).astype(np.uint8)
-    # Beside another mirror a spot at the edge may be the other's; beside the ground it is not.
+    # Beside another mirror, a spot at the edge may belong to that mirror; beside the ground it
+    # cannot.
     free = np.where(cv2.dilate(other, _disc(MARGIN + 1)) > 0, np.uint8(0), inside)
     narrower = MARGIN if shown is not None else 1
     square = np.ones((3, 3), np.uint8)
     inside = np.asarray(cv2.erode(inside, square, iterations=narrower), np.uint8)
     whole = np.asarray(inside | free, np.uint8)
-    # For three colours, operators are quicker than NumPy's reductions.
+    # For three colours, operators are faster than NumPy's reductions.
     bright = np.minimum(np.minimum(raw[..., 0], raw[..., 1]), raw[..., 2]) >= CLIPPED
     area = int(inside.sum())
     if area < 30:
@@ -446,7 +451,7 @@ def _spots_of(
     spots = []
     peaks = (raised >= top) & (raised > limit)
     own = _own_peaks(light, raised, peaks, inside, whole)
-    # Corners of facets at a gap rise by less than this: they are no light beside another one.
+    # Facet corners at a gap are brighter by less than this, and are not light beside another light.
     least = _LAMP * float(np.median(light[inside > 0]))
     places = [(a, b) for a, b, height, _ in own if height > least]
     for i, j, excess, held in own:
@@ -464,12 +469,12 @@ def _own_peaks(
     inside: npt.NDArray[np.uint8],
     whole: npt.NDArray[np.uint8],
 ) -> list[tuple[int, int, float, npt.NDArray[np.uint8]]]:
-    """Return row, column, height and mask of the peaks that belong to a mirror.
+    """Return the row, column, height and mask of each peak that belongs to a mirror.
 
     The blurred edge of a brighter neighbour brightens this mirror's corner, most of all beside dark
     ground, and half of a spot on the mirror behind is visible over this mirror's edge. A true spot
     is the brightest point of its surroundings in the whole picture, and that point is on this
-    mirror: in the searched part, ``inside``, or beside the ground in ``whole``.
+    mirror, either in the searched part, ``inside``, or in ``whole`` beside the ground.
     """
     import cv2
 
@@ -484,7 +489,7 @@ def _own_peaks(
         a, b = np.unravel_index(int(np.argmax(part)), part.shape)
         top = first[0] + int(a), first[1] + int(b)
         if whole[top] and smooth[top] >= around[top]:
-            # Only a peak beside the searched part needs more of the mirror.
+            # The rest of the mirror is needed only for a peak beside the searched part.
             tops.setdefault(top, (float(raised[i, j]), inside if inside[top] else whole))
     return [(*place, *peak) for place, peak in tops.items()]
 
@@ -504,7 +509,7 @@ def _without(
 
 @cache
 def _disc(radius: int) -> Picture:
-    """Return a disc of ones, (2 radius + 1,) squared."""
+    """Return a disc of ones in a square array with sides of 2 radius + 1."""
     x = np.arange(-radius, radius + 1)
     return np.asarray(np.hypot(x, x[:, None]) < radius + 0.5, np.uint8)
 
@@ -527,10 +532,11 @@ def _centroid(
     noise: float,
     raised: float,
 ) -> tuple[FloatArray, float, float, int] | None:
-    """Return centre (x, y), sigma, flux and clipped pixels of the spot at row i, column j.
+    """Return the centre (x, y), sigma, flux and clipped pixels of the spot at row i, column j.
 
-    The centre is the mean of the light above the mirror's, under a Gaussian weight that moves with
-    it; for a clipped spot, the plain mean of the light above half of the peak.
+    The centre is the mean of the light in excess of the mirror's, with a Gaussian weight that is
+    moved to the centre. For a clipped spot it is the unweighted mean of the light above half of the
+    peak.
     """
     rows = np.arange(max(i - _WINDOW, 0), min(i + _WINDOW + 1, light.shape[0]))
     columns = np.arange(max(j - _WINDOW, 0), min(j + _WINDOW + 1, light.shape[1]))
@@ -541,8 +547,8 @@ def _centroid(
     if int(ring.sum()) < 6:
         return None
     above = np.where(held, part - np.median(part[ring]), 0.0)
-    # Where gaps between facets cross, or beside a hidden part, the surrounding mean is low; a true
-    # spot is also brighter than the bright part of its surroundings.
+    # Where gaps between facets cross, or beside a hidden part, the surrounding mean is low. A true
+    # spot is therefore also required to be brighter than the bright part of its surroundings.
     if float(part[far < 1.2].mean() - np.quantile(part[ring], 0.97)) < 0.8 * raised:
         return None
     clipped = int(np.sum(bright[np.ix_(rows, columns)] & (far <= _WINDOW)))
@@ -571,6 +577,6 @@ def _centroid(
     flux = float(above[far <= 3.5].sum())
     if flux <= 0.0:
         return None
-    # Noise of a centroid: pixel noise times its lever, over the light.
+    # The noise of a centroid is the pixel noise times its lever, divided by the light.
     sigma = float(np.hypot(noise * 1.2 * np.sqrt(20.0) * 1.5 / flux, 0.03 + 0.02 * (clipped > 3)))
     return center, sigma, flux, clipped

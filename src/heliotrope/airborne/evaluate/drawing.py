@@ -1,6 +1,6 @@
 """Small SVG drawings, each produced in a few milliseconds; a flight report contains hundreds.
 
-Matplotlib needs 0.4 s for one such picture, most of it for text. Here the browser sets the text,
+Matplotlib needs 0.4 s for one such picture, most of it for text. Here the browser renders the text,
 and every point can have a tooltip.
 """
 
@@ -38,11 +38,11 @@ class Panel:
     x, y
         Lowest and highest value shown.
     title, across, up
-        Texts above, below, and to the left.
+        Texts above, below, and to the left of the frame.
     labels
-        Texts of the ticks below, at 0, 1, …; numbers if empty.
+        Texts of the ticks on the lower side, at 0, 1, …; numbers are used if empty.
     parts
-        The elements inside.
+        The elements inside the frame.
     """
 
     left: float
@@ -58,7 +58,7 @@ class Panel:
     parts: list[SvgElement] = field(default_factory=list)
 
     def equal(self) -> "Panel":
-        """Widen one range so that both axes have the same scale; returns the panel."""
+        """Widen one range so that both axes have the same scale, and return the panel."""
         scale = min(self.width / (self.x[1] - self.x[0]), self.height / (self.y[1] - self.y[0]))
         for name, size in (("x", self.width), ("y", self.height)):
             low, high = getattr(self, name)
@@ -192,13 +192,13 @@ def around(values: npt.ArrayLike, share: float = 0.08) -> tuple[float, float]:
 
 
 def round_below(value: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is not above ``value`` > 0."""
+    """Return the largest round number (1, 2 or 5 times a power of ten) up to ``value`` > 0."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= 1.000001 * value))
 
 
 def numbered(low: float, high: float, most: int) -> list[tuple[float, str]]:
-    """Return at most ``most`` round values between two, with their texts."""
+    """Return at most ``most`` round numbers from ``low`` to ``high``, with their texts."""
     step = round_below((high - low) / most)
     while (high - low) / step > most:
         step = round_below(2.5000001 * step)

@@ -1,17 +1,19 @@
 r"""Positions of mirror edges in brightness profiles, whatever lies beside the mirrors.
 
 Beside a mirror there may be its shadow, or sunlit grass, or both within the blur of the lens. The
-slope of a profile then does not indicate the position of the edge: rendered mirrors with a narrow
-shadow below appeared 0.1 px too short, all on the same side, and the camera position was wrong by
-0.06 m at a distance of 150 m. The profile inside the edge is hardly affected. Therefore
+slope of a profile then does not indicate the position of the edge. For example, rendered mirrors
+with a narrow shadow below them appeared 0.1 px too short, all on the same side, and the camera
+position was wrong by 0.06 m at a distance of 150 m. The profile inside the edge is hardly affected.
+Therefore
 
 $$ p(x) = L - A\,Φ\!\left(\frac{x - x_0}{s}\right) $$
 
-is fitted, where L is the light of the mirror, A the contrast to what adjoins it, and x₀ the edge.
-If most edges in a photograph lie in front of uniform ground, the whole profile is used, otherwise
-only the part up to `_OUTSIDE` beyond the edge. That part has four times the noise, but noise
-averages out over mirrors and photographs, whereas shadows do not. The blur s is the same for all
-edges of one direction in a photograph, because a single profile could not separate it from A.
+is fitted, where L is the light of the mirror, A the contrast with its surroundings, and x₀ the
+edge. If most edges in a photograph lie in front of uniform ground, the whole profile is used;
+otherwise only the part up to `_OUTSIDE` beyond the edge is used. A fit to that part has four times
+the noise, but noise averages out over mirrors and photographs, whereas shadows do not. The blur s
+is the same for all edges of one direction in a photograph, because a single profile could not
+separate s from A.
 """
 
 import numpy as np
@@ -23,21 +25,22 @@ Mask = npt.NDArray[np.bool_]
 
 #: The part of a profile that is fitted, from the edge outwards, px.
 _INSIDE, _OUTSIDE = -3.0, 1.0
-#: Blur of an edge to start from, and its limits, px.
+#: Starting value of the blur of an edge, and its limits, px.
 _BLUR, _SHARPEST, _SOFTEST = 0.9, 0.3, 3.0
 _ROUNDS = 5
-#: What lies beside an edge is even if its mean profile is off by no more than this many times the
-#: noise. With a larger share of other edges, of at least so many, none is measured from outside.
+#: The surroundings of an edge are even if its mean profile deviates by no more than this many times
+#: the noise. If at least so many edges were fitted and a larger fraction of them is uneven, no edge
+#: is measured from outside.
 _EVEN, _MANY, _ENOUGH = 1.5, 0.25, 20
-#: A fit that moves an edge further than this, px, or takes this share from its contrast, is not
-#: one of an edge.
+#: A fit that moves an edge further than this, px, or lowers its contrast by this fraction, is not
+#: the fit of an edge.
 _FARTHEST, _WEAKEST = 0.6, 0.4
 
 
 def cross_edges(
     colour: FloatArray, steps: FloatArray, reach: float, clear: Mask, groups: int, *, fitted: bool
 ) -> tuple[FloatArray, FloatArray, Mask]:
-    """Return offsets (M, 4, G) of the edges, the least contrast (M,), and which are valid.
+    """Return edge offsets, (M, 4, G), the least contrast, (M,), and a mask of valid offsets.
 
     Parameters
     ----------
@@ -46,11 +49,11 @@ def cross_edges(
     steps
         Positions along a profile, outwards from the expected edge, px, (S,).
     reach
-        Largest distance of an edge from the expected one, px.
+        Largest distance of an edge from the expected edge, px.
     clear
         Which profiles lie on the mirror inside and on ground outside, (M, 4, P).
     groups
-        Groups G in which profiles are averaged.
+        Number G of groups in which profiles are averaged.
     fitted
         Whether edges are fitted; otherwise they are placed at the centre of the slope.
     """
@@ -89,16 +92,16 @@ def cross_edges(
 def _fit_edges(
     profile: FloatArray, steps: FloatArray, start: FloatArray, contrast: FloatArray
 ) -> FloatArray:
-    """Return where edges cross profiles, px along ``steps``, (M, 4, G).
+    """Return where the edges cross the profiles, px along ``steps``, (M, 4, G).
 
     Parameters
     ----------
     profile
         Light across each of the four edges of M mirrors in G groups, outwards, (M, 4, G, S).
     steps
-        Places along a profile, px, (S,).
+        Positions along a profile, px, (S,).
     start
-        First estimate, (M, 4, G); kept where the fit fails.
+        First estimate, (M, 4, G), which is kept where the fit fails.
     contrast
         Inner minus outer light of each edge, (M, 4).
     """
@@ -114,7 +117,7 @@ def _fit_edges(
     for side in (0, 1):
         these = good & (pair == side)
         if these.any():
-            # Shadows beside an edge increase its residuals, so the blur is taken from the other
+            # Shadows beside an edge increase its residuals, so the blur is estimated from the other
             # edges.
             rest = np.sqrt(np.mean(gap**2, axis=1))
             even = these & (rest <= np.median(rest[these]))
@@ -131,7 +134,7 @@ def _fit_edges(
 
 
 def _uneven(gap: FloatArray, usable: Mask) -> Mask:
-    """Return the mask of edges (M, 4) whose residuals exceed noise in all groups, (M, 4, G, S)."""
+    """Return a mask of the edges (M, 4) whose residuals (M, 4, G, S) exceed noise in all groups."""
     count = np.maximum(usable.sum(axis=-1), 1)
     kept = np.where(usable[..., None], gap, 0.0)
     mean = kept.sum(axis=2) / count[..., None]
@@ -142,7 +145,7 @@ def _uneven(gap: FloatArray, usable: Mask) -> Mask:
 
 
 def _plausible(fits: FloatArray, first: FloatArray, jump: FloatArray) -> Mask:
-    """Return the mask (K,) of fits (K, 4) that put the edge near the first estimate."""
+    """Return a mask (K,) of the fits (K, 4) that place the edge near the first estimate."""
     with np.errstate(invalid="ignore"):
         near = np.abs(fits[:, 2] - first) < _FARTHEST
         strong = fits[:, 1] > _WEAKEST * jump
@@ -159,9 +162,9 @@ def _fit(
     *,
     free: bool,
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit L, A, x₀ and s to profiles (K, S); return them, (K, 4), and the residuals over A.
+    """Fit L, A, x₀ and s to profiles (K, S); return the values, (K, 4), and the residuals over A.
 
-    The fit is a Gauss-Newton iteration; s is fitted only where it is free.
+    The fit is a Gauss-Newton iteration; s is fitted only where ``free`` is true.
     """
     from scipy.special import ndtr
 
@@ -175,7 +178,8 @@ def _fit(
         u = (steps - numbers[:, 2:3]) / numbers[:, 3:]
         share, bell = ndtr(u), np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi)
         if turn == 0:
-            # The contrast is linear: the best for the first estimate of the place.
+            # The model is linear in the contrast, which starts at its best value for the first
+            # position.
             top = np.sum(weight * share * (level[:, None] - profile), axis=1)
             numbers[:, 1] = top / np.maximum(np.sum(weight * share**2, axis=1), 1e-12)
         light, height = numbers[:, :1], numbers[:, 1:2]

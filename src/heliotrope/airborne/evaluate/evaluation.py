@@ -1,8 +1,8 @@
-"""Evaluates one pose of a field: converts photographs to reflections on mirrors.
+"""Evaluate one pose of a field: convert photographs to reflections on mirrors.
 
 All photographs together determine the exterior orientation of each photograph and the common RTK
 offset (`heliotrope.airborne.evaluate.bundle`). Then the ray of each spot is intersected with its
-mirror (`heliotrope.airborne.evaluate.rays`). In a moonless night no corner is visible, and
+mirror (`heliotrope.airborne.evaluate.rays`). On a moonless night no corner is visible, and
 `heliotrope.airborne.evaluate.night` replaces the bundle adjustment.
 """
 
@@ -22,9 +22,9 @@ from heliotrope.airborne.standing import MirrorPoses
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
 
-#: Objects beside a mirror shift its edges alike in all photographs, px. Where shadows touch the
-#: lower edges, rendered mirrors are 0.03 px off, alike in a row of eight: as much as 0.06 px would
-#: do for mirrors that are independent.
+#: Shift of a mirror's edges, the same in all photographs, due to objects beside it, px. Where
+#: shadows touch the lower edges, rendered mirrors are 0.03 px off. All eight mirrors of a row share
+#: this error, so it matters as much as independent errors of 0.06 px.
 EDGE_BIAS = 0.06
 #: The stated corner errors are kept if the residuals agree with them within this factor.
 _AGREE = 1.15
@@ -45,12 +45,12 @@ class FlightEvaluation:
     adjusted
         The bundle adjustment.
     stand
-        The mirrors, as determined from their corners.
+        The mirrors, with poses determined from their corners.
     place_covariance
-        Covariance of each mirror's position relative to the drone, m², (N, 3, 3): shared by all its
-        reflections.
+        Covariance of each mirror's position relative to the drone, m², (N, 3, 3). All reflections
+        on the mirror share this error.
     reflections
-        One record per spot on a mirror; ``photo`` counts the photographs used.
+        One record per spot on a mirror; ``photo`` is an index into the used photographs.
     problems
         A message for each photograph that was not used.
     """
@@ -86,7 +86,7 @@ def evaluate(
     stand
         The mirrors in their expected poses.
     shape
-        Function that returns the surface of a mirror by index; slopes do not matter here.
+        Function that returns the surface of a mirror, given its index; slopes do not matter here.
     priors
         Prior standard deviations of the bundle adjustment.
     owner
@@ -145,7 +145,7 @@ def _evaluate_dark(
     priors: Priors,
     problems: tuple[str, ...],
 ) -> FlightEvaluation:
-    """Evaluate a dark flight: attitudes from the lights alone, positions from RTK."""
+    """Evaluate a dark flight, with attitudes from the lights alone and positions from RTK."""
     start = [p.moved(p.position, s.rotation) for p, s in zip(recorded, readings, strict=True)]
     turned = turn_together(start, readings, camera, stand, shape)
     position = as_float([p.position for p in recorded])
@@ -238,7 +238,7 @@ def adjust_photos(
 
 
 def disagrees(adjusted: Adjusted) -> bool:
-    """Return whether the corners scatter more or less than their standard deviations say."""
+    """Return whether the corners scatter more or less than their standard deviations imply."""
     return bool(np.isfinite(adjusted.deviation) and not 1.0 / _AGREE < adjusted.deviation < _AGREE)
 
 

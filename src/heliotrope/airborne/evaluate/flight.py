@@ -1,4 +1,4 @@
-"""Evaluates a drone flight, from its folder of photographs to sightings."""
+"""Evaluate a drone flight, from its folder of photographs to sightings."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,10 +25,11 @@ from heliotrope.field.plant import Plant
 if TYPE_CHECKING:
     from distributed import Client
 
-#: Called with the name of the step, and the numbers of items done and in all.
+#: Function called with the name of the step, the number of items done, and the total number.
 Progress = Callable[[str, int, int], None]
 
-#: Survey (10 mm) and kinematics (30 mm) as HelioPoint assumes them; the 30 mm of RTK base are ours.
+#: Survey (10 mm) and kinematics (30 mm) as HelioPoint assumes them; the 30 mm for the RTK base is
+#: our assumption.
 PRIORS = Priors(offset=0.030, position=0.010, kinematics=0.030)
 
 
@@ -104,7 +105,7 @@ class CampaignResult:
 
     @property
     def impossible(self) -> tuple[str, ...]:
-        """A message for each sighting that is physically impossible."""
+        """Messages, one for each sighting that is physically impossible."""
         sightings, reasons = self._judged
         if sightings is None:
             return ()
@@ -120,11 +121,11 @@ class CampaignResult:
         return sightings, judge_in(self.plant, sightings).reasons
 
     def orientation_rows(self) -> list[dict[str, Any]]:
-        """Return one record per orientation, with its systematic part split by cause."""
+        """Return one record per orientation, with its systematic error split by cause."""
         return [row for f in self.flights for row in f.measured.rows(f.data.name)]
 
     def orientation_warnings(self) -> list[tuple[str, str]]:
-        """Return pairs of a heliostat and a warning about its orientation."""
+        """Return pairs of a heliostat name and a warning about its orientation."""
         return [
             (f.label(f.measured.found.names[o.heliostat]), warning)
             for f in self.flights
@@ -141,7 +142,7 @@ class CampaignResult:
         }
 
     def document(self) -> dict[str, Any]:
-        """Return the result as a record for JSON."""
+        """Return the result as a JSON object."""
         warnings: dict[str, list[str]] = {}
         for name, warning in self.orientation_warnings():
             warnings.setdefault(name, []).append(warning)
@@ -181,7 +182,7 @@ def evaluate_flight(
     order:
 
     1. ``folder.open_flights``: photographs, camera and commands become a ``FlightData``.
-    2. ``reading.read_many``: each photograph is evaluated to a ``PhotoReading``.
+    2. ``reading.read_many``: each photograph is converted to a ``PhotoReading``.
        ``reading.read_photo``, ``detection.find_patches``, ``identification.identify``,
        ``detection.find_outlines``, ``detection.find_spots``.
     3. ``campaign.evaluate_campaign``: flights that share heliostats are evaluated together.
@@ -204,7 +205,7 @@ def evaluate_flight(
     priors
         Prior standard deviations.
     axis
-        What the optical axis of a mirror means: the mean in
+        How the optical axis of a mirror is defined: the kind of mean in
         `heliotrope.airborne.evaluate.orientation.measure`.
     matches
         Table of mirrors that a user has identified in photographs
@@ -235,7 +236,7 @@ def evaluate_flight(
         warnings += [*left_out, *_missing_photographs(named, opened)]
     flights = [read_flight(f, keep, processes, client, progress) for f in opened]
     campaign = evaluate_campaign(flights, priors)
-    # The RTK base is part of each mirror's position as the adjustment knows it.
+    # The mirror positions from the adjustment already include the error of the RTK base.
     budget = Budget(priors.position, priors.kinematics, 0.0)
     results = [
         _measure(flight, evaluation, budget, axis)
@@ -251,13 +252,13 @@ def evaluate_flight(
 
 
 def _turned(flight: FlightData, named: Matches) -> FlightData:
-    """Return a flight with the attitudes that follow from positions named by a user."""
+    """Return a flight with the attitudes that follow from mirror positions identified by a user."""
     photos, problems = turn_by_hand(flight.photos, flight.camera, flight.stand, named, flight.name)
     return replace(flight, photos=photos, problems=(*flight.problems, *problems))
 
 
 def _missing_photographs(named: Matches, flights: Sequence[FlightData]) -> list[str]:
-    """Return a message for each photograph that is named but does not exist."""
+    """Return a message for each photograph that the table names but that does not exist."""
     present = {name for f in flights for p in f.photos for name in (p.name, f"{f.name}/{p.name}")}
     missing = dict.fromkeys(name for name in named.photo if name not in present)
     return [

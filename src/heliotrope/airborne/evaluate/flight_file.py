@@ -1,11 +1,11 @@
-"""A campaign as a file for the plant: orientations with the errors that they share.
+"""A campaign as a file for the plant: orientations, with the errors that they share.
 
-The error in a mirror's position relative to the drone has several parts. One is common to all
+The error in a mirror's position relative to the drone has several parts. One part is common to all
 mirrors of a bundle adjustment (the remainder of the RTK offset, and half of an error in the lamp
-offset), one grows with the distance from the middle of the photographs (the focal length), one is
-common to all poses of a mirror (the survey), and only the remainder belongs to a single pose
-(kinematics). A fit that treats all parts as independent between poses trusts many mirrors too much;
-see `heliotrope.calibration.fit.common`.
+offset). Another grows with the distance from the middle of the photographs (focal length), a third
+is common to all poses of a mirror (survey), and only the rest belongs to a single pose
+(kinematics). A fit that treats all parts as independent between poses puts too much trust in a
+large number of mirrors; see `heliotrope.calibration.fit.common`.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from heliotrope.airborne.evaluate.sightings import mean_sigma
 from heliotrope.calibration.flights import FlightDocument, FlightRow, flight_name
 from heliotrope.geometry import FloatArray
 
-#: Relative error of a calibrated focal length: half a pixel of 5,000.
+#: Relative error of a calibrated focal length: half a pixel in 5,000.
 LENS = 1e-4
 
 
@@ -32,9 +32,9 @@ class _Group:
     adjusted
         The adjustment.
     place
-        Index of its first shared error.
+        Index of the group's first shared error.
     middle
-        Mean position of its mirrors, ENU, m, (3,).
+        Mean position of the group's mirrors, ENU, m, (3,).
     """
 
     adjusted: Adjusted
@@ -52,8 +52,8 @@ def flight_document(
     result
         The campaign.
     name
-        Name, unique in the plant that will import it; "": time of the first photograph and name of
-        the plant.
+        Name, unique in the plant that will import the file. If empty, the name consists of the time
+        of the first photograph and the plant name.
     lens
         Relative standard deviation of the focal length.
     """
@@ -114,7 +114,7 @@ def _row(flight: FlightResult, o: Orientation, group: _Group, count: int, at: fl
     away = across @ (o.vertex - group.middle)
     shift = np.zeros((3, count))
     shift[:, group.place : group.place + 3] = np.eye(3)
-    # A mirror that appears farther out is farther from the drone's axis, so the drone is farther
+    # A mirror that appears farther out is farther from the camera axis, so the drone is farther
     # back.
     shift[:, -1] = -away
     return FlightRow(
@@ -130,7 +130,7 @@ def _row(flight: FlightResult, o: Orientation, group: _Group, count: int, at: fl
 
 
 def _beside(whole: FloatArray, common: FloatArray) -> FloatArray:
-    """Return a covariance without a common part, with no negative variance, (3, 3)."""
+    """Return a covariance, (3, 3), less its common part, without negative variances."""
     values, vectors = np.linalg.eigh(whole - common)
     remainder = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return np.asarray(0.5 * (remainder + remainder.T))

@@ -25,7 +25,7 @@ class FlightData:
     Attributes
     ----------
     name
-        Name of the flight; empty if it is the only one.
+        Name of the flight; empty if it is the only flight.
     photos
         Photographs as recorded by the drone.
     camera
@@ -33,11 +33,11 @@ class FlightData:
     stand
         The mirrors, as commanded.
     heliostat
-        Their indices in the plant, (N,).
+        Indices of the heliostats in the plant, (N,).
     counts
-        Counts of their drives, (N, D).
+        Drive counts, (N, D).
     shapes
-        Their surfaces, (N,), with slope maps if available.
+        Surfaces of the mirrors, (N,), with slope maps if available.
     problems
         A message for each photograph that cannot be used.
     seen
@@ -60,12 +60,15 @@ class FlightData:
 
     @property
     def corners(self) -> int:
-        """Number of corners visible in its photographs."""
+        """Number of corners visible in the photographs of the flight."""
         return sum(int(np.isfinite(s.corners).all(axis=-1).sum()) for s in self.seen)
 
     @property
     def dark(self) -> bool:
-        """Whether its photographs show the lamp but no mirror edge; it is then evaluated alone."""
+        """Whether the photographs show the lamp but no mirror edge.
+
+        A dark flight is evaluated without the other flights of its campaign.
+        """
         return not self.corners and any(s.has_lights for s in self.seen)
 
     def unused(self) -> list[str]:
@@ -89,7 +92,7 @@ def open_flights(
     slopes: Path | None = None,
     focal: float = np.inf,
 ) -> tuple[list[FlightData], list[str], list[str]]:
-    """Return the flights in a folder in the order of their names.
+    """Return the flights in a folder, sorted by name.
 
     A folder with photographs is one flight. A folder of such folders is a campaign, in which each
     flight has its own ``camera.toml`` and ``commands.csv`` or shares those of the campaign. From a
@@ -104,12 +107,12 @@ def open_flights(
     camera, commands
         Files to use instead of ``camera.toml`` and ``commands.csv``.
     cluster, point
-        Cluster and point whose commands to use for a single flight; "" for all.
+        Cluster and point whose commands are used for a single flight; "" for all commands.
     slopes
         Folder of slope maps, NAME.npz or NAME.csv, or of deflectometry files in PAINT's format,
         NAME.h5.
     focal
-        Focal length of the facets, m; inf if flat.
+        Focal length of the facets, m; inf for flat facets.
 
     Returns
     -------
@@ -164,14 +167,14 @@ def open_flight(
     cluster: str = "",
     point: str = "",
 ) -> FlightData:
-    """Return the photographs of one folder with the camera and the commanded mirrors.
+    """Return the photographs of one folder, with the camera and the mirrors as commanded.
 
     Parameters
     ----------
     folder, plant, camera, commands, cluster, point
         See `open_flights`.
     shape
-        Function that returns the surface of a heliostat by name.
+        Function that returns the surface of a heliostat, given its name.
     """
     site = plant.site
     photos, problems = read_photos(folder, (site.latitude_deg, site.longitude_deg, site.height))
@@ -206,12 +209,12 @@ def open_flight(
 
 
 def natural_key(name: str) -> list[tuple[str, int]]:
-    """Return a key that sorts C1-2 before C1-10."""
+    """Return a sort key that places C1-2 before C1-10."""
     return [(text, int(number or 0)) for text, number in re.findall(r"([^0-9]*)([0-9]*)", name)]
 
 
 def designed_shape(plant: Plant, focal: float = np.inf) -> Callable[[str], MirrorShape]:
-    """Return a function that returns the designed surface of a heliostat by name."""
+    """Return a function that returns the designed surface of a heliostat, given its name."""
     return lambda name: ideal(*plant.find(name), focal=focal)
 
 
@@ -240,7 +243,7 @@ class _Surfaces:
 
     @property
     def missing(self) -> list[str]:
-        """A message for each heliostat without a slope map.
+        """Messages, one for each heliostat without a slope map.
 
         Raises
         ------

@@ -1,13 +1,13 @@
-"""Identifies mirrors: the field is projected into a photograph and matched with its patches.
+"""Identify mirrors by projecting the field into a photograph and matching it with the patches.
 
 The position of a photograph is known to centimetres and its attitude to about a degree, so only a
 small rotation is unknown. It is found by voting: each pair of a patch and an expected mirror votes
 for the shift between the two, at several rotations about the line of sight. The best few shifts are
-refined by solving Wahba's problem on the pairs that are then close together. The solution with the
-most close matches and the fewest unmatched mirrors and patches wins. If another solution that
-identifies the mirrors differently is nearly as good, neither is trusted.
+refined by solving Wahba's problem on the pairs that are then close together. The best solution has
+the most close matches and the fewest unmatched mirrors and patches. If another solution that
+identifies the mirrors differently is nearly as good, neither of the two is trusted.
 
-In a moonless night only the lamp is visible. A mirror in its commanded pose shows the lamp at the
+On a moonless night only the lamp is visible. A mirror in its commanded pose shows the lamp at the
 foot of the perpendicular from the drone, so these points are matched with the spots instead.
 """
 
@@ -27,25 +27,28 @@ Rows = npt.NDArray[np.intp]
 
 #: Largest gimbal error that is searched, rad.
 GIMBAL = float(np.radians(4.0))
-#: Largest error of a gimbal that is searched where the mirrors fit badly, rad: rows are nearly
-#: periodic, so the field shifted by a row may fit half-way while the gimbal is further off.
+#: Largest gimbal error that is searched if the mirrors fit badly, rad. The rows of a field are
+#: nearly periodic, so a field shifted by one row may seem to fit although the gimbal error is
+#: larger.
 FAR_GIMBAL = float(np.radians(12.0))
-#: A solution fits badly beyond this RMS distance of patches from mirrors, in mirrors' sides, or
-#: with a smaller share of mirrors and patches matched. Beyond the second distance it is not
-#: trusted, nor with this share of both mirrors and patches left over, as a shifted field leaves.
-#: Rendered photographs have 0.01 to 0.05, shifted fields 0.03 to 0.17 with 60 to 85 % matched.
+#: A solution fits badly if the RMS distance of patches from mirrors exceeds the first value, in
+#: mirror sides, or if a smaller fraction of mirrors and patches matches than the next. It is not
+#: trusted beyond the second distance, nor if this fraction of both mirrors and patches is left
+#: over, as with a shifted field. Rendered photographs have distances of 0.01 to 0.05, shifted
+#: fields 0.03 to 0.17 with 60 to 85 % matched.
 _BAD_FIT, _WORST_FIT, _GOOD_SHARE, _LEFT = 0.06, 0.08, 0.92, 0.1
-#: Fewest mirrors that must match, and their least share of those expected in the frame.
+#: Minimum number of mirrors that must match, and their minimum fraction of the mirrors expected in
+#: the frame.
 FEWEST, LEAST_SHARE = 4, 0.4
 #: The best solution must explain this many more mirrors and patches than any other.
 MARGIN = 4.0
-#: Typical gimbal error, rad: a standard deviation, weighed like half a mirror.
+#: Typical gimbal error, rad; one such standard deviation counts as much as half a mirror.
 USUAL_GIMBAL = float(np.radians(1.5))
-#: With a median reading below this, a photograph is dark.
+#: A photograph is dark if its median reading is below this.
 DARK_READING = 25
 #: More lights than this in a dark photograph are not reflections of the lamp.
 _MOST_LIGHTS = 5000
-#: How far beside its mirror a light may appear before the camera's attitude is known, m.
+#: Distance from its mirror at which a light may appear before the camera attitude is known, m.
 BESIDE = 0.5
 _TURNS, _CANDIDATES, _ROUNDS = 17, 10, 6
 
@@ -59,12 +62,12 @@ class Identified:
     rotation
         Camera axes to ENU, (3, 3).
     mirror, patch
-        Pairs of a mirror's row and a patch, (K,).
+        Index pairs of a mirror and a patch, (K,).
     reason
-        Why no solution is trusted; empty if one is.
+        Why no solution is trusted; an empty string if one is.
     shifted
-        Whether the field seems to fit only where it is shifted: laid over the photograph it would
-        fit there too.
+        Whether the apparent fit is that of a shifted field. A drawing laid over the photograph
+        would then seem to fit in the same wrong position.
     """
 
     rotation: FloatArray
@@ -77,7 +80,7 @@ class Identified:
 def expected_size(
     camera: LedCamera, photo: Photo, stand: MirrorPoses, gimbal: float = GIMBAL
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Return the apparent sides of mirrors, px, and which of them may be in the frame, (M,).
+    """Return the apparent sides of mirrors, px, and a mask of those that may be in the frame, (M,).
 
     The side is the square root of the area. A mirror may be in the frame if a gimbal error can
     bring it there.
@@ -96,16 +99,16 @@ def expected_size(
 
 
 def quad_area(corners: FloatArray) -> FloatArray:
-    """Return the areas of quadrilaterals (M, 4, 2), (M,); NaN where a corner is."""
+    """Return the areas, (M,), of quadrilaterals (M, 4, 2); NaN where a corner is NaN."""
     ahead = np.roll(corners, -1, axis=1)
     cross = corners[..., 0] * ahead[..., 1] - corners[..., 1] * ahead[..., 0]
     return as_float(0.5 * np.abs(cross.sum(axis=1)))
 
 
 def nearest_rotation(directions: FloatArray, rays: FloatArray) -> FloatArray:
-    """Return the rotation (3, 3) that best turns unit ``rays`` into ``directions``, (K, 3) each.
+    """Return the rotation that best turns unit ``rays`` (K, 3) into ``directions`` (K, 3).
 
-    Wahba's problem, solved by singular values.
+    This is Wahba's problem, solved by a singular value decomposition.
     """
     u, _, vt = np.linalg.svd(directions.T @ rays)
     return as_float(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
@@ -185,7 +188,7 @@ def _farther(
     near: Identified,
     fit: "_Fit | None",
 ) -> Identified:
-    """Return an attitude far from the gimbal's if it fits clearly better than a near one."""
+    """Return an attitude far from the gimbal's if it fits clearly better than one near it."""
     none = np.empty(0, dtype=np.intp)
     _, visible = expected_size(camera, photo, stand, FAR_GIMBAL)
     rows = np.flatnonzero(visible)
@@ -220,9 +223,9 @@ def _farther(
 
 @dataclass(frozen=True)
 class _Tried:
-    """A solution: its attitude, its pairs of a mirror and a patch, and how well it fits.
+    """A solution: an attitude, pairs of a mirror and a patch, and how well they fit.
 
-    ``apart``: their RMS distance, in mirrors' sides.
+    ``apart`` is the RMS distance of the patches from their mirrors, in mirror sides.
     """
 
     score: float
@@ -253,7 +256,7 @@ def _starts(
         for _ in range(3):
             i, j = np.unravel_index(int(np.argmax(votes)), votes.shape)
             x, y = ((np.array([i, j]) + 0.5) / cells * 2.0 - 1.0) * reach
-            # To shift the image by (x, y) the camera turns about its down and right axes.
+            # To shift the image by (x, y), the camera rotates about its down and right axes.
             move = rotation([0.0, 1.0, 0.0], x) @ rotation([1.0, 0.0, 0.0], -y)
             total = turned @ rotation([0.0, 0.0, 1.0], turn) @ move.T
             ranked.append((float(votes[i, j]), total))
@@ -314,7 +317,7 @@ class _Fit:
     left
         Unmatched mirrors or unmatched patches, whichever are fewer, divided by the number of pairs.
     apart
-        RMS distance of patches from their mirrors, in mirrors' sides.
+        RMS distance of patches from their mirrors, in mirror sides.
     """
 
     solution: _Tried
@@ -327,7 +330,7 @@ class _Fit:
 
     @property
     def good(self) -> bool:
-        """Whether there is no reason to look elsewhere."""
+        """Whether the fit is good enough that no other attitude need be searched."""
         return self.apart < _BAD_FIT and self.matched > _GOOD_SHARE
 
     def differs(self, other: "_Fit") -> bool:
@@ -348,7 +351,7 @@ def _ranked(
     patches: int,
     most: float,
 ) -> list[_Fit]:
-    """Return the solutions at most an angle from the gimbal's, the best first."""
+    """Return the solutions within the angle ``most`` of the gimbal attitude, the best first."""
     fits = []
     for solution in tried:
         angle = rotation_angle(solution.rotation, photo.rotation)
@@ -357,7 +360,7 @@ def _ranked(
             continue
         pixels = photo.moved(photo.position, solution.rotation).pixels(camera, stand.vertex[rows])
         inside = int(((pixels > 0) & (pixels < np.array(camera.size) - 1)).all(axis=-1).sum())
-        # Mirrors without a patch, and patches without a mirror.
+        # Count mirrors without a patch, and patches without a mirror.
         absent, surplus = max(inside - matched, 0), patches - matched
         usual = 0.5 * (angle / USUAL_GIMBAL) ** 2
         evidence = solution.score - 0.5 * (absent + surplus)
@@ -377,7 +380,7 @@ def _choose(
     rows: Rows,
     patches: int,
 ) -> tuple[Identified, _Fit | None]:
-    """Return the best solution and its fit, or why it is not trusted."""
+    """Return the best solution and its fit, or the reason why it is not trusted."""
     none = np.empty(0, dtype=np.intp)
     ranked = _ranked(tried, photo, camera, stand, rows, patches, 2.0 * GIMBAL)
     if not ranked:
@@ -417,7 +420,7 @@ def is_dark(picture: Picture) -> bool:
 
 
 def expected_feet(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> tuple[FloatArray, Rows]:
-    """Return where mirrors in expected poses show the lamp, (K, 3), and their indices, (K,)."""
+    """Return where mirrors in expected poses show the lamp, (K, 3), and mirror indices, (K,)."""
     between = photo.position + 0.5 * (photo.led_position(camera) - photo.position)
     local = np.einsum("nji,nj->ni", stand.rotation, between - stand.vertex)
     half = 0.5 * np.ptp(stand.outline[..., :2], axis=1)
@@ -430,7 +433,7 @@ def expected_feet(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> tuple[
 def find_lights(
     picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses
 ) -> tuple[Identified, Spots]:
-    """Return the attitude of the camera, and the spots with their mirrors (rows of ``stand``).
+    """Return the camera attitude, and the spots with their mirrors as indices into ``stand``.
 
     Spots that lie on no mirror are left out.
     """
@@ -465,7 +468,7 @@ def find_lights(
 
 
 def _mirrors_of(plane: FloatArray, photo: Photo, turn: FloatArray, stand: MirrorPoses) -> Rows:
-    """Return the mirror that each light lies on, -1 for none."""
+    """Return the index of the mirror on which each light lies; -1 if it lies on none."""
     directions = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1) @ turn.T
     start = np.einsum("nji,nj->ni", stand.rotation, photo.position - stand.vertex)
     local = np.einsum("nji,sj->sni", stand.rotation, directions)
@@ -475,6 +478,7 @@ def _mirrors_of(plane: FloatArray, photo: Photo, turn: FloatArray, stand: Mirror
     half = 0.5 * np.ptp(stand.outline[..., :2], axis=1)
     off = np.where(length > 0.0, np.max(np.abs(at) - half, axis=-1), np.inf)
     nearest = np.argmin(np.where(np.isfinite(off), off, np.inf), axis=1)
-    # The attitude is known to a few milliradians only: allow for that beside the mirror.
+    # The attitude is known only to a few milliradians, so lights this far beside the mirror are
+    # allowed.
     inside = off[np.arange(len(plane)), nearest] < BESIDE
     return np.where(inside, nearest, -1).astype(np.intp)

@@ -1,9 +1,9 @@
 """Mirrors identified by a user in photographs that the program cannot match by itself.
 
 HelioPoint improves the camera attitude "using automatic or manual feature matching". A table lists
-where in a photograph some mirrors, or their corners, are visible. These positions determine the
-attitude by Wahba's problem, which replaces that of the gimbal. The photograph is then evaluated
-like all others, but from an attitude that needs no search.
+where in a photograph some mirrors, or their corners, are visible. Solving Wahba's problem for these
+positions yields the attitude, which replaces that of the gimbal. The photograph is then evaluated
+like all others, except that its attitude need not be searched for.
 """
 
 from collections.abc import Sequence
@@ -21,14 +21,16 @@ from heliotrope.field.camera import undistort
 from heliotrope.files.cells import Rows, find_heliostats, read_rows
 from heliotrope.geometry import FloatArray, as_float
 
-#: What a row may name: the corners in the order of an outline, the mirror's middle, the lamp on it.
+#: What a row of the table may name: the corners in the order of an outline, the middle of the
+#: mirror, or the lamp's reflection on it.
 CORNERS = ("upper left", "upper right", "lower right", "lower left")
 MIDDLE, LIGHT = "middle", "light"
 #: Columns of the table.
 COLUMNS = ("photo", "heliostat", "corner", "x_px", "y_px")
-#: Fewest places that give an attitude; with three, a wrong name can be noticed.
+#: Minimum number of positions that determine an attitude; with three, a wrong name can be detected.
 FEWEST = 2
-#: A place this many mirrors' sides from where the others put it has a wrong name.
+#: A position has a wrong name if it is this many mirror sides from where the other positions
+#: predict it.
 _OFF = 0.4
 
 
@@ -60,7 +62,7 @@ class Matches:
         return len(self.photo)
 
     def of(self, photo: str, flight: str) -> npt.NDArray[np.intp]:
-        """Return the rows of a photograph."""
+        """Return the indices of the positions in a photograph."""
         names = (photo, f"{flight}/{photo}")
         return np.array([k for k, name in enumerate(self.photo) if name in names], dtype=np.intp)
 
@@ -68,8 +70,8 @@ class Matches:
 def read_matches(path: str | Path, names: Sequence[str]) -> tuple[Matches, list[str]]:
     """Return the positions in a table, and a message for each row that was left out.
 
-    Rows without a heliostat are skipped: they are outlines without a name. An empty
-    ``corner`` is the middle of the mirror.
+    Rows without a heliostat are skipped, because they are outlines that the user has not named. An
+    empty ``corner`` means the middle of the mirror.
 
     Parameters
     ----------
@@ -123,7 +125,7 @@ def turn_by_hand(
     matches: Matches,
     flight: str = "",
 ) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """Return photographs with attitudes from positions named by a user, and the problems.
+    """Return photographs with attitudes from positions identified by a user, and the problems.
 
     Parameters
     ----------
@@ -136,7 +138,7 @@ def turn_by_hand(
     matches
         Named positions.
     flight
-        Name of the flight; empty if it is the only one.
+        Name of the flight; empty if it is the only flight.
 
     Returns
     -------
@@ -161,7 +163,7 @@ def _turned(
     matches: Matches,
     rows: npt.NDArray[np.intp],
 ) -> Photo | str:
-    """Return a photograph with the attitude from its named positions, or why it has none."""
+    """Return a photograph with the attitude from its named positions, or why that failed."""
     unknown = [matches.heliostat[k] for k in rows if matches.heliostat[k] not in stand.names]
     if unknown:
         return f"heliostat {unknown[0]} was not commanded in this flight; correct the name"
@@ -175,7 +177,7 @@ def _turned(
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     mirrors = np.array([stand.names.index(matches.heliostat[k]) for k in rows])
     current = photo
-    # Where the lamp is seen on a mirror depends on the lamp's own place, and so on the attitude.
+    # Where the lamp is seen on a mirror depends on the lamp's position, and hence on the attitude.
     for _ in range(2):
         points = np.stack(
             [

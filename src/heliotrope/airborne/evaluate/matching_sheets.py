@@ -25,15 +25,15 @@ from heliotrope.files.text import write_file, write_text
 if TYPE_CHECKING:
     from heliotrope.airborne.evaluate.folder import FlightData
 
-#: Blue, green, red.
+#: Colours, as blue, green, red.
 _FOUND, _EXPECTED, _RULER = (0, 0, 255), (255, 160, 0), (255, 255, 255)
-#: Distance of the ruler's ticks, and of those with a number, px.
+#: Distance between the ruler's ticks, and between ticks with a number, px.
 _TICK, _NUMBER = 100, 500
 
 
 @dataclass(frozen=True)
 class Sheets:
-    """The files written: pictures, table, and the number of outlines in each picture."""
+    """Files that were written (pictures and table), and number of outlines in each picture."""
 
     pictures: tuple[Path, ...]
     table: Path
@@ -48,14 +48,15 @@ def write_sheets(flights: "Sequence[FlightData]", names: Sequence[str], out: Pat
     flights
         Flights whose photographs have been read.
     names
-        Names of photographs, NAME or FLIGHT/NAME; if empty, all in which no mirror was identified.
+        Names of photographs, NAME or FLIGHT/NAME; if empty, all photographs in which no mirror was
+        identified.
     out
         Folder.
 
     Raises
     ------
     InputError
-        If there is nothing to name, a photograph is unknown, or the folder already contains a
+        If there is nothing to identify, a photograph is unknown, or the folder already contains a
         table.
     """
     table = out / "matches.csv"
@@ -112,7 +113,7 @@ def _chosen(
 
 
 def _patches(picture: Picture, camera: LedCamera, photo: Photo, stand: MirrorPoses) -> Patches:
-    """Return the largest set of patches that is not far larger than the number of mirrors."""
+    """Return the largest set of patches whose number does not far exceed the number of mirrors."""
     side, near = expected_size(camera, photo, stand)
     if not near.any():
         return Patches(np.empty((0, 2)), np.empty(0))

@@ -1,14 +1,14 @@
-r"""A flight in a moonless night, when only the lamp is visible in the mirrors.
+r"""Evaluate a flight on a moonless night, when only the lamp is visible in the mirrors.
 
 A reflection on a flat mirror is seen along the mirror normal, wherever on the mirror it lies. The
 spots in all photographs therefore determine the rotations of mirrors and photographs relative to
-each other, but not the rotation of all of them together, for which corners would be needed. That
+each other, but not the common rotation of all of them, for which corners would be needed. The
 common rotation is chosen such that, on average, the mirrors have their commanded orientations. With
-N mirrors that deviate by σ from their commands, it is known to
+N mirrors that deviate by σ from their commands, the covariance of the common rotation is
 
 $$ C_ω = σ^2 \Big( \sum_i (I - n_i n_i^T) \Big)^{-1} $$
 
-that is, to about σ/√N, which is included in the standard deviation of every orientation.
+that is, about σ/√N per axis, which is included in the standard deviation of every orientation.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, rotation
 
 _ROUNDS = 12
-#: Turns below this no longer matter, rad.
+#: Smaller rotations than this no longer matter, rad.
 _STILL = 5e-5
 
 Rows = npt.NDArray[np.intp]
@@ -57,17 +57,17 @@ class Turned:
     common: FloatArray
 
     def place_covariance(self, place: float) -> FloatArray:
-        """Return the covariance of each mirror's position shared by its reflections, (N, 3, 3), m².
+        """Return the covariance of each mirror's position shared by its reflections, m², (N, 3, 3).
 
         Parameters
         ----------
         place
-            Standard deviation of the mirrors' positions relative to the drone, m; the photographs
-            do not improve it.
+            Standard deviation of the mirrors' positions relative to the drone, m, which the
+            photographs do not improve.
 
         Notes
         -----
-        A rotation ω of the photographs moves a mirror at d by ω × d.
+        A rotation ω of the photographs displaces a mirror at d by ω × d.
         """
         middle = as_float([p.position for p in self.photos]).mean(axis=0)
         away = self.stand.vertex - middle
@@ -91,7 +91,7 @@ def turn_together(
     Parameters
     ----------
     photos, readings
-        Photographs with attitudes to a few mrad, and their readings.
+        Photographs with attitudes accurate to a few mrad, and their readings.
     camera
         The camera with its lamp.
     stand

@@ -1,4 +1,4 @@
-r"""The orientation of mirrors from reflections of the drone's lamp.
+r"""Measure the orientation of mirrors from reflections of the drone's lamp.
 
 Each reflection measures one normal, the bisector of the directions to the lamp and the camera. The
 shape of the mirror determines the normal expected at that point. The small rotation ω, about the
@@ -7,12 +7,13 @@ concentrator's own x and y axes, from the expected normal n to the measured norm
 $$ ω = \frac{n × v}{|n × v|} \arcsin |n × v| $$
 
 The orientation is corrected by the mean of all ω, over the points or over the mirror area. Because
-the points move on the mirror with the orientation, this is done twice; then outliers are rejected
-(Rosner's test of each component), and the final mean is the result. The remaining ω at each point,
-its *angular difference*, contains all information on accuracy and on the facets.
+the points move on the mirror when the orientation changes, the correction is made twice. Then
+outliers are rejected (Rosner's test of each component), and the final mean is the result. The
+remaining ω at each point, its *angular difference*, contains all information on accuracy and on the
+facets.
 
-Two rounds, the test and a final mean are HelioPoint's procedure; the mean over the area is our own
-addition.
+The two rounds, the test and the final mean are HelioPoint's procedure; the mean over the area is
+our own addition.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -39,19 +40,21 @@ from heliotrope.airborne.visibility import FEWEST
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, azimuth_elevation, rotation
 
-#: Mean over the points: equal weights, or weights that represent the whole area.
+#: Kinds of mean over the points: with equal weights, or with weights that represent the whole area.
 Mean = Literal["plain", "area"]
 
-#: Rounds of mean and correction before the test for outliers.
+#: Number of rounds of mean and correction before the test for outliers.
 ROUNDS = 2
-# With as many well measured mirrors, the others are taken to scatter like them.
+# If at least this many mirrors are well measured, the rest are assumed to scatter like them.
 _ENOUGH_MIRRORS = 5
-# Distance of the points' centre from the mirror's that raises a warning, in half widths.
+# Distance between the centres of the points and of the mirror that causes a warning, in half
+# widths.
 _OFF_CENTRE = 0.25
-# A facet is canted off if its mean differs this many standard errors, and this much (rad).
+# The canting of a facet is off if its mean differs by this many standard errors, and by this angle,
+# rad.
 _CANTED_SIGMA, _CANTED = 4.0, 0.5e-3
-# p below which the differences are reported as not normal: HelioPoint's threshold. One good mirror
-# in ten fails it in one of its two components.
+# Below this p-value (HelioPoint's threshold) the differences are reported as not normal. One good
+# mirror in ten fails the test in one of its two components.
 _NORMAL = 0.05
 
 
@@ -64,8 +67,8 @@ class FacetMean:
     facet, count
         Facet index, and its number of points without outliers, unless most points are outliers.
     mean
-        Mean of the differences, rotX and rotY, rad, (2,): its canting error relative to the mean of
-        all; NaN without points.
+        Mean of the differences, rotX and rotY, rad, (2,), which is the facet's canting error
+        relative to the mean of all facets; NaN if the facet has no points.
     sigma
         Standard error of the mean, σ/√n, rad, (2,).
     """
@@ -94,7 +97,7 @@ class Orientation:
     reflections
         The n reflections, outliers included.
     point
-        Positions of their camera, ENU metres, (n, 3).
+        Positions of the camera for each reflection, ENU metres, (n, 3).
     outlier
         (n,).
     weight
@@ -186,7 +189,7 @@ class Orientations:
     left_out: Mapping[str, str]
 
     def of(self, name: str) -> Orientation | None:
-        """Return the orientation of heliostat ``name``, or None if it was not measured."""
+        """Return the orientation of heliostat ``name``; None if the heliostat was not measured."""
         return next((o for o in self.found if self.names[o.heliostat] == name), None)
 
 
@@ -198,7 +201,7 @@ def differences(
     *,
     slopes: bool = True,
 ) -> FloatArray:
-    """Return the rotations from expected to measured normals about x and y, rad, (n, 2).
+    """Return the rotations about x and y from expected to measured normals, rad, (n, 2).
 
     Parameters
     ----------
@@ -207,7 +210,7 @@ def differences(
     shape
         Shape of its mirror.
     rotation, vertex
-        Its orientation, (3, 3), and vertex, ENU metres, (3,).
+        Orientation, (3, 3), and vertex, ENU metres, (3,), of the mirror.
     slopes
         Whether expected normals include the slope map, if there is one.
     """
@@ -222,7 +225,7 @@ def differences(
 
 
 def turned(R: npt.ArrayLike, rot: npt.ArrayLike) -> FloatArray:
-    """Return an orientation (3, 3) rotated by rotX and rotY (2,), rad, about its own axes."""
+    """Return orientation ``R`` rotated by rotX and rotY, rad, about its own axes, (3, 3)."""
     x, y = as_float(rot)
     axis = np.array([x, y, 0.0])
     return as_float(R) @ rotation(axis, float(np.hypot(x, y)))
@@ -231,7 +234,7 @@ def turned(R: npt.ArrayLike, rot: npt.ArrayLike) -> FloatArray:
 def rotation_between(R: npt.ArrayLike, other: npt.ArrayLike) -> FloatArray:
     """Return rotX, rotY and rotZ, rad, (3,), that rotate orientation ``R`` into ``other``.
 
-    They are the components of a single rotation, along R's own axes.
+    The three angles are the components of a single rotation vector along the axes of R.
     """
     from scipy.spatial.transform import Rotation
 
@@ -269,17 +272,18 @@ def measure(
     slopes
         Whether to use the slope map, if available.
     budget
-        Errors common to all points; None: the default budget.
+        Errors common to all points; None for the default budget.
     place
-        Covariance of the mirror's position relative to the drone, m², (3, 3), see
+        Covariance of the mirror's position relative to the drone, m², (3, 3); see
         `Budget.covariance`.
     mean
-        "area", weighted to represent the whole mirror, or "plain", equal weights, as in HelioPoint.
-        Without a slope map the plain mean is worse, because points cluster where the surface is
-        flat.
+        "area" for weights that represent the whole mirror, or "plain" for equal weights, as in
+        HelioPoint. Without a slope map the plain mean is worse, because points cluster where the
+        surface is flat.
     scatter
         Prior standard deviation of one difference, rad, which stabilises σ if there are few
-        reflections. By default HelioPoint's value, with or without a slope map.
+        reflections. The default is HelioPoint's value, which depends on whether there is a slope
+        map.
     alpha, rounds
         False-alarm probability of the outlier test, and number of corrections before it.
 
@@ -301,7 +305,7 @@ def measure(
         return turned(R, _mean(omega, own, shape, keep, mean))
 
     for _ in range(rounds):
-        # Any mean brings the points to their positions.
+        # Any kind of mean moves the points to their positions.
         R = update(R, "plain")
     omega = differences(own, shape, R, where(R), slopes=slopes)
     keep = ~(rosner(omega[:, 0], alpha=alpha) | rosner(omega[:, 1], alpha=alpha))
@@ -340,12 +344,13 @@ def measure_field(
     slopes, budget, mean
         See `measure`.
     places
-        Covariances of their positions relative to the drone, m², (N, 3, 3).
+        Covariances of the mirror positions relative to the drone, m², (N, 3, 3).
 
     Notes
     -----
-    A heliostat that cannot be measured is listed with the reason, and the rest continue. For
-    mirrors with few reflections, σ is stabilised by the scatter of the well-measured mirrors.
+    A heliostat that cannot be measured is listed with the reason, and the other heliostats are
+    still measured. For mirrors with few reflections, σ is stabilised by the scatter of the
+    well-measured mirrors.
     """
     turns, feet = as_float(rotation), as_float(vertex)
     covariances = None if places is None else as_float(places)
@@ -439,7 +444,7 @@ def _result(
     known = spread_mean(kept, shape, part.facet, uv, prior)
     every = vertex + shape.point_at(own.facet, own.xy) @ R.T
     point = every[keep]
-    # A turn about x moves the normal towards −y, one about y towards x.
+    # A rotation about x moves the normal towards −y, and a rotation about y towards x.
     axes = np.stack([-R[:, 1], R[:, 0]])
     weight = np.zeros(len(own))
     weight[keep] = known.weights if mean == "area" else 1.0 / len(kept)
@@ -476,7 +481,7 @@ def _facet_means(
     for k in range(len(shape)):
         on = facet == k
         used = on & keep
-        # On a canted facet most points are outliers of the mirror, but right for the facet.
+        # On a wrongly canted facet most points are outliers of the mirror, but valid for the facet.
         mine = difference[used if 2 * used.sum() >= on.sum() else on]
         mean = mine.mean(axis=0) if len(mine) else np.full(2, np.nan)
         means.append(FacetMean(k, len(mine), mean, plain_sigma(mine)))
@@ -537,11 +542,11 @@ def _tilt_by_gradient(o: Orientation, xy: FloatArray, offset: FloatArray) -> Flo
 
 
 def _off_the_others(o: Orientation, f: FacetMean) -> FloatArray | None:
-    """Return a facet's mean minus the median of the others' means, if significant."""
+    """Return a facet's mean minus the median of the other facets' means, if significant."""
     others = [g for g in o.facets if g.facet != f.facet and g.count >= 3]
     if f.count < 3 or not others:
         return None
-    # Use the median, so that the one deviating facet is reported and not all the others.
+    # Use the median, so that the deviating facet is reported rather than all the other facets.
     away = f.mean - np.median([g.mean for g in others], axis=0)
     error = np.sqrt(f.sigma**2 + np.mean([g.sigma**2 for g in others], axis=0))
     if ((np.abs(away) > _CANTED_SIGMA * error) & (np.abs(away) > _CANTED)).any():

@@ -1,11 +1,12 @@
-r"""Camera positions for photographs of coded targets, from the images alone.
+r"""Locate photographs of coded targets from the images alone.
 
-A bundle adjustment with free points. The unknowns are the rotation φ and the position p of each
-photograph, each corner X of each target, and the errors of the camera file (focal lengths,
+This is a bundle adjustment with free points. Its unknowns are the rotation φ and the position p of
+each photograph, each corner X of each target, and the errors of the camera file (focal lengths,
 principal point, distortion). A corner is seen at OpenCV's projection of $(R e^{[φ]})^T (X - p)$.
-Images do not determine the position, rotation and scale of the whole, so RTK positions constrain
-these loosely. `compared` then fits the result to the RTK positions by a similarity transform, as in
-HelioPoint's appendix A; the residuals are the errors of RTK and of the photogrammetry.
+Images do not determine the position, rotation and scale of the whole scene, so RTK positions
+constrain these loosely. `compared` then fits the result to the RTK positions by a similarity
+transform, as in HelioPoint's appendix A; the residuals are the errors of RTK and of the
+photogrammetry.
 """
 
 from collections.abc import Sequence
@@ -24,15 +25,15 @@ from heliotrope.geometry import FloatArray, as_float, cross_matrix, rotation
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
-#: Photographs and targets that an adjustment needs, and targets that a photograph needs.
+#: Minimum numbers of photographs and of targets in an adjustment, and of targets in a photograph.
 FEWEST_PHOTOS, FEWEST_TARGETS, FEWEST_OF_PHOTO = 8, 4, 3
-#: Standard deviations before the adjustment: positions by RTK, m (the size and place of the whole
-#: are known to this over the root of the number); focal lengths, relative; principal point, px;
-#: k1, k2, p1, p2, k3.
+#: Standard deviations before the adjustment: RTK positions, m (the size and position of the whole
+#: scene are known to this value divided by the square root of the number of photographs); relative
+#: focal lengths; principal point, px; k1, k2, p1, p2, k3.
 _LOOSE, _FOCAL, _CENTER = 1.0, 0.01, 20.0
 _DISTORTION = np.array([0.05, 0.1, 0.005, 0.005, 0.1])
 _LENS = 9
-#: Residuals beyond this many standard deviations weigh less.
+#: Residuals beyond this many standard deviations receive less weight.
 _HUBER = 2.5
 _MOST_ROUNDS, _STILL = 40, 1e-7
 
@@ -76,7 +77,8 @@ class Photogrammetry:
         Covariance of the positions relative to each other, after the best similarity transform, m²,
         (3P, 3P).
     deviation
-        RMS of the residuals in units of their standard deviations; 1 if these are correct.
+        RMS of the residuals in units of their standard deviations; 1 if the standard deviations are
+        right.
     sights
         Corners used.
     """
@@ -96,7 +98,7 @@ class Photogrammetry:
 
 
 def usable(targets: Sequence[SeenTargets]) -> tuple[list[int], dict[int, str]]:
-    """Return the usable photographs, and why others cannot be used, by index.
+    """Return the usable photographs by index, and why the other photographs cannot be used.
 
     Targets visible in fewer than two photographs do not count.
     """
@@ -123,7 +125,7 @@ def locate(
     Parameters
     ----------
     photos, targets
-        Photographs as recorded, and the targets in each; all usable.
+        Photographs as recorded, and the targets in each photograph; all must be usable.
     camera
         Lens as stated in the camera file.
 
@@ -193,7 +195,7 @@ def _start(photos: Sequence[Photo], sights: Sights, camera: LedCamera, points: i
 
 
 def _projected(state: _State, sights: Sights) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return pixels (K, 2), and their derivatives: by φ, p, X (K, 2, 9), and lens (K, 2, 9)."""
+    """Return pixels (K, 2) and their derivatives with respect to φ, p and X, and to the lens."""
     import cv2
 
     local = np.einsum(
@@ -215,7 +217,7 @@ def _projected(state: _State, sights: Sights) -> tuple[FloatArray, FloatArray, F
 def _adjusted(
     state: _State, photos: Sequence[Photo], camera: LedCamera, sights: Sights
 ) -> tuple[_State, Photogrammetry, FloatArray]:
-    """Return the adjusted unknowns, the result without its covariance, and the normal matrix."""
+    """Return the adjusted unknowns, the result without covariance, and the normal matrix."""
     from scipy.linalg import cho_factor, cho_solve
 
     known, size = state, 6 * len(photos) + len(state.points) * 3 + _LENS
@@ -310,9 +312,9 @@ def _result(state: _State, made: Photogrammetry, normal: FloatArray) -> Photogra
 
 
 def relative(position: FloatArray) -> FloatArray:
-    """Return the matrix (3P, 3P) that removes the best similarity transform from displacements.
+    """Return the matrix (3P, 3P) that removes the best similarity transform of displacements.
 
-    It leaves the part of P displacements that no common shift (3), rotation (3) or scale (1)
+    What remains of P displacements is the part that no common shift (3), rotation (3) or scale (1)
     explains.
     """
     away = position - position.mean(axis=0)
@@ -325,9 +327,9 @@ def relative(position: FloatArray) -> FloatArray:
 
 
 def compared(recorded: FloatArray, adjusted: FloatArray) -> tuple[FloatArray, float]:
-    """Return recorded minus adjusted positions after the best similarity, (P, 3), and its scale.
+    """Return recorded minus adjusted positions after a similarity fit, (P, 3), and its scale.
 
-    The adjusted positions (P, 3) are fitted to the recorded ones (Umeyama 1991).
+    The adjusted positions (P, 3) are fitted to the recorded positions (Umeyama 1991).
     """
     a, b = adjusted - adjusted.mean(axis=0), recorded - recorded.mean(axis=0)
     u, size, vt = np.linalg.svd(b.T @ a)

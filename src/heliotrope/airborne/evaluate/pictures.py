@@ -21,11 +21,11 @@ _BAR = "#bbccdd"
 _ENDS = np.array([-1.0, 1.0])
 # Size of a heliostat's picture, px.
 _SIZE = (1180.0, 500.0)
-# Drawn length of the RMS difference, in widths of the mirror.
+# Length of the arrow for the RMS difference, in mirror widths.
 _ARROW = 0.06
-# Most labels of facets side by side.
+# Maximum number of facet labels side by side.
 _MOST_LABELS = 6
-#: Most heliostats with arrows, and most with names, in the map.
+#: Maximum numbers of heliostats drawn with arrows and with names on the map.
 MOST_ARROWS, MOST_NAMES = 300, 40
 
 
@@ -33,8 +33,8 @@ def heliostat_drawing(name: str, o: Orientation, shape: MirrorShape) -> str:
     """Return the picture of one heliostat, as SVG.
 
     It shows the sampling points on the mirror, each with an arrow for the tilt of its normal
-    relative to the expected normal, and the differences about both axes: their distribution, by
-    facet, and in the order of the photographs.
+    relative to the expected normal. It also shows the differences about both axes: their
+    distribution, by facet, and in the order of the photographs.
     """
     panels = [_points(o, shape), _distribution(o, 0), _distribution(o, 1), _facets(o), _order(o)]
     title = f"{name}: {o.count} reflections, {int(o.outlier.sum())} rejected, {o.distance:.0f} m"
@@ -151,7 +151,7 @@ def _points(o: Orientation, shape: MirrorShape) -> Panel:
         panel.line(outline[:, 0], outline[:, 1], "#444", closed=True)
         left, low = outline.min(axis=0).tolist()
         panel.text(left, low, str(k) if len(shape) > 1 else "")
-    # A turn about x moves the normal towards −y, one about y towards x.
+    # A rotation about x moves the normal towards −y, and a rotation about y towards x.
     lean = 1e3 * np.stack([o.difference[:, 1], -o.difference[:, 0]], axis=-1)
     size = rms(np.linalg.norm(lean[good], axis=-1))
     if size > 0.0:

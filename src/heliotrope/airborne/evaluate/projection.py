@@ -1,9 +1,9 @@
-"""Identifies overlapping mirrors by registering a drawing of the known field to the photograph.
+"""Identify overlapping mirrors by registering a drawing of the known field to the photograph.
 
 Seen from a low drone, mirrors merge into one bright shape without separate patches, so
-`heliotrope.airborne.evaluate.identification` has nothing to vote with. But that shape is
-predictable: the mirrors are drawn as expected from the recorded position and gimbal angles, with
-nearer mirrors in front, and the drawing is shifted and rotated over the photograph until the two
+`heliotrope.airborne.evaluate.identification` finds no patches that could vote. But that shape is
+predictable. The mirrors are drawn as expected from the recorded position and gimbal angles, with
+nearer mirrors in front. The drawing is then shifted and rotated over the photograph until the two
 correlate best (OpenCV's ``matchTemplate``, then ``findTransformECC``: Evangelidis and Psarakis
 2008, IEEE Transactions on Pattern Analysis and Machine Intelligence 30, 1858). If the drawing fits
 nearly as well elsewhere, no position is trusted.
@@ -33,20 +33,22 @@ Image = npt.NDArray[np.float32]
 
 #: Side of a typical mirror in the reduced picture, px.
 _SIDE = 10.0
-#: Minimum correlation of drawing and photograph, and how far the best place must exceed any other.
+#: Minimum correlation of drawing and photograph, and by how much the best position must exceed any
+#: other.
 LEAST, MARGIN = 0.7, 0.06
-#: With this correlation of its light, the colour of a photograph is not tried.
+#: If the brightness correlates this well, the colour of a photograph is not tried.
 _CERTAIN = 0.9
-#: A place is another one if it is this far away, in mirrors' sides.
+#: A position counts as a different one if it is this far away, in mirror sides.
 _APART = 0.6
-#: Correlation that a typical gimbal error costs: the usual place wins where two fit alike.
+#: Correlation deducted for a typical gimbal error, so that the usual position wins if two fit
+#: equally well.
 _USUAL = 0.01
 _TURNS, _CANDIDATES, _ROUNDS = 17, 4, 60
 
 
 @dataclass(frozen=True)
 class _Place:
-    """A position where the drawing fits: correlation, attitude, and mirror centres, px, (M, 2)."""
+    """A position where the drawing fits: correlation, attitude and mirror centres, px, (M, 2)."""
 
     fit: float
     rotation: FloatArray
@@ -56,7 +58,7 @@ class _Place:
 def outlines(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> tuple[FloatArray, FloatArray]:
     """Return the corners of all mirrors in a photograph, px, (N, 4, 2), and their distances, (N,).
 
-    Includes mirrors seen from behind, because they hide others.
+    Mirrors seen from behind are included, because they hide other mirrors.
     """
     away = np.linalg.norm(stand.vertex - photo.position, axis=-1)
     return photo.pixels(camera, stand.corners), as_float(away)
@@ -102,7 +104,7 @@ def overlay(picture: Picture, camera: LedCamera, photo: Photo, stand: MirrorPose
 def _drawing(
     photo: Photo, camera: LedCamera, stand: MirrorPoses, scale: float, border: int
 ) -> tuple[Image, FloatArray]:
-    """Return the drawing of the mirrors with a border, and their corners, px of the picture."""
+    """Return the drawing of the mirrors with a border, and the mirror corners, picture px."""
     import cv2
 
     corners, away = outlines(photo, camera, stand)
@@ -176,7 +178,7 @@ def _refined(
     scale: float,
     turned: FloatArray,
 ) -> _Place | None:
-    """Return the position to which an attitude's drawing converges; None if it does not."""
+    """Return the position to which an attitude's drawing converges; None if it diverges."""
     import cv2
 
     fit, middle = -1.0, np.empty((0, 2))

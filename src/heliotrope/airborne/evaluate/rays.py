@@ -1,4 +1,4 @@
-"""From spots to reflections: the ray of each spot is intersected with its mirror surface."""
+"""Convert spots to reflections by intersecting the ray of each spot with its mirror surface."""
 
 from collections.abc import Callable, Sequence
 
@@ -14,9 +14,10 @@ from heliotrope.geometry import FloatArray, as_float
 
 ShapeOf = Callable[[int], MirrorShape]
 
-#: The position of a spot on a mirror is not known better than this share of a pixel.
+#: The position of a spot on a mirror is known to no better than this fraction of a pixel.
 SPOT_FLOOR = 0.15
-#: A spot between facets is the mirror's own if it has this share of the typical light.
+#: A spot between facets belongs to the mirror if it has at least this fraction of the typical
+#: light.
 _WEAK = 0.6
 
 
@@ -41,10 +42,10 @@ def spot_reflections(
     stand
         The mirrors.
     shape
-        Function that returns the surface of a mirror by index; slopes do not matter here.
+        Function that returns the surface of a mirror, given its index; slopes do not matter here.
     shifts
-        Displacement of each mirror's image in each photograph, undistorted coordinates,
-        (P, N, 2); none if omitted.
+        Displacement of each mirror's image in each photograph, in undistorted coordinates, (P, N,
+        2); default: none.
     beside
         Rays that miss all facets by more than this (and a few per cent of a facet) are left
         out, m.
@@ -70,7 +71,7 @@ def spot_reflections(
         facet, xy = _intersect(shape(int(row)), start, directions[mine] @ turned, beside)
         kept = facet >= 0
         if beside == 0.0:
-            # The spot of a mirror behind shines weakly through a gap between facets.
+            # The spot on a mirror behind this one is weakly visible through a gap between facets.
             kept &= (shape(int(row)).facet_at(xy) >= 0) | (flux[mine] > _WEAK * typical)
         distance = np.linalg.norm(start, axis=-1)
         # Foreshortening blurs the position of a spot along an oblique mirror.
@@ -87,7 +88,7 @@ def spot_reflections(
 def _intersect(
     shape: MirrorShape, start: FloatArray, directions: FloatArray, beside: float
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
-    """Return the facet (-1 beside the mirror) and position (S, 2) where rays meet the surface."""
+    """Return where rays meet the surface: facet (-1 beside the mirror) and position (S, 2)."""
     height = np.zeros(len(directions))
     facet = np.full(len(directions), -1, dtype=np.intp)
     xy = np.zeros((len(directions), 2))
@@ -101,7 +102,7 @@ def _intersect(
 
 
 def _nearest_facet(shape: MirrorShape, xy: FloatArray, beside: float) -> npt.NDArray[np.intp]:
-    """Return the facet at each position, in a gap the nearer one, or -1 beside the mirror."""
+    """Return the facet at or nearest to each position; -1 for a position beside the mirror."""
     facet = shape.facet_at(xy)
     outside = np.flatnonzero(facet < 0)
     if len(outside):

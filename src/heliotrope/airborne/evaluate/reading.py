@@ -1,4 +1,4 @@
-"""Reads photographs: which mirrors each one shows, their corners, and the lamp spots on them.
+"""Read photographs: which mirrors each shows, their corners, and the lamp spots on them.
 
 Results are undistorted image coordinates, X/Z and Y/Z in camera axes, so that later steps do not
 need the image. A photograph that cannot be used is reported with the reason; no exception is
@@ -50,16 +50,16 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 Rows = npt.NDArray[np.intp]
 
-#: Corner error beyond that of the edges, from texture beside the mirror, px.
+#: Corner error due to texture beside the mirror, in addition to that of the edges, px.
 CORNER_FLOOR = 0.07
-#: Corners this far from a common shift of the outline belong to another edge: px, and share of
+#: Corners this far from a common shift of the outline belong to another edge; px, and fraction of
 #: the mirror's side.
 _SKEW, _SKEW_SHARE = 1.5, 0.03
-#: Largest distance of edges from those of mirrors laid over a photograph, px.
+#: Largest distance of edges from the mirror edges of an overlaid drawing, px.
 _OVERLAID = 3.0
-#: The same where a person has named mirrors: share of a mirror's side, and limits, px.
+#: The same distance if a user has identified mirrors: fraction of a mirror's side, and limits, px.
 _BY_HAND, _BY_HAND_PX = 0.15, (3.0, 12.0)
-#: Problems that a person can solve who sees which mirror is which, and how.
+#: Problems that a user can solve by identifying mirrors, and how to do so.
 _NAMEABLE = ("nothing", "wrong_field", "ambiguous")
 BY_HAND = "name mirrors in it by hand (heliotrope drone match, then drone evaluate --matches)"
 #: With fewer photographs, starting processes costs more time than it saves.
@@ -83,10 +83,10 @@ class PhotoReading:
     name
         Name of the photograph.
     problem
-        Why the photograph cannot be used; empty if it can. Begins with a keyword: nothing,
-        wrong_field, ambiguous, overexposed, small, unreadable.
+        Why the photograph cannot be used; an empty string if it can. The text begins with a
+        keyword: nothing, wrong_field, ambiguous, overexposed, small, unreadable.
     rotation
-        Camera axes to ENU, estimated from the mirrors alone, (3, 3).
+        Rotation from camera axes to ENU, estimated from the mirrors alone, (3, 3).
     mirror
         Indices of the visible mirrors, (M,).
     corners
@@ -96,13 +96,15 @@ class PhotoReading:
     spot_mirror
         Mirror index of each spot, (S,).
     spot, spot_sigma
-        Undistorted coordinates, (S, 2), and their standard deviation per direction, (S,).
+        Undistorted coordinates of each spot, (S, 2), and their standard deviation per direction,
+        (S,).
     flux
         Flux of each spot, full scale times pixels, (S,).
     clipped
-        Clipped pixels of each spot, (S,).
+        Number of clipped pixels of each spot, (S,).
     notes
-        For each mirror, why it yields no spot or no outline; empty if it yields both, (M,).
+        For each mirror, why it yields no spot or no outline; an empty string if it yields both,
+        (M,).
     """
 
     name: str
@@ -134,7 +136,7 @@ class PhotoReading:
         return self.problem.startswith(_NAMEABLE)
 
     def why_unused(self) -> str:
-        """Return the reason why its corners cannot be used; empty if they can."""
+        """Return the reason why the corners cannot be used; an empty string if they can."""
         if self.has_corners:
             return ""
         if self.nameable:
@@ -226,7 +228,7 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) 
     identified = Identified(photo.rotation, _no_rows(), _no_rows(), "nothing: no patches")
     for patches in find_patches(picture, typical**2):
         attempt = identify(camera, photo, stand, patches.center)
-        # Report the attempt that got farthest: any reason but "nothing" says more.
+        # Report the attempt that got farthest, because any reason other than "nothing" says more.
         if not attempt.reason or identified.reason.startswith("nothing"):
             identified = attempt
         if not identified.reason:
@@ -236,7 +238,8 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) 
             return _lights(picture, photo, camera, stand)
         if identified.shifted:
             return PhotoReading(photo.name, identified.reason)
-        # Clouds in mirrors or a few that touch spoil patches, but not the field as a whole.
+        # Clouds in mirrors, or a few mirrors that touch, spoil patches but not the field as a
+        # whole.
         laid = _look_overlapping(picture, photo, camera, stand)
         return PhotoReading(photo.name, identified.reason) if laid.problem else laid
     turned = photo.moved(photo.position, identified.rotation)
@@ -254,7 +257,7 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) 
 def _look_overlapping(
     picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses
 ) -> PhotoReading:
-    """Return the reading of a picture in which mirrors hide parts of each other."""
+    """Return the reading of a picture in which mirrors partly hide each other."""
     if is_dark(picture):
         return _lights(picture, photo, camera, stand)
     identified = overlay(picture, camera, photo, stand)
@@ -273,7 +276,7 @@ def _look_along(
 ) -> PhotoReading:
     """Read a picture whose attitude is accurate to the first of ``reaches``, px."""
     turned = photo
-    # Edges against the ground correct the attitude; then they are measured where they belong.
+    # Edges against the ground correct the attitude, and are then measured at their new positions.
     for reach in reaches:
         rows, expected = _in_frame(turned, camera, stand)
         if not len(rows):
@@ -300,13 +303,13 @@ def _nothing_in_frame(photo: Photo) -> PhotoReading:
 
 
 def _consistent(lines: Outlines, expected: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return the mask of corners (M, 4) that were found and do not belong to another edge."""
+    """Return a mask of the corners (M, 4) that were found and do not belong to another edge."""
     size = np.sqrt(quad_area(expected))
     shift = np.where(lines.known[..., None], lines.corners - expected, np.nan)
     if not lines.known.any():
         return lines.known
-    # A turn of the camera moves the corners of a mirror together, not one by one. Of one or two
-    # corners the median says nothing; then that of the photograph does.
+    # A rotation of the camera moves all corners of a mirror together. The median of only one or two
+    # corners says nothing, so the median of the photograph is used instead.
     common = np.broadcast_to(np.nanmedian(shift, axis=(0, 1)), (len(shift), 1, 2)).copy()
     enough = lines.known.sum(axis=1) >= 3
     common[enough] = np.nanmedian(shift[enough], axis=1, keepdims=True)
@@ -381,7 +384,7 @@ def _lights(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPose
 
 
 def _in_frame(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> tuple[Rows, FloatArray]:
-    """Return the mirrors with all corners in the frame, and those corners, px."""
+    """Return the mirrors whose corners are all in the frame, and these corners, px."""
     pixels = photo.pixels(camera, stand.corners)
     width, height = camera.size
     with np.errstate(invalid="ignore"):
@@ -420,7 +423,7 @@ def read_many(
     keep: Path | None = None,
     progress: Progress | None = None,
 ) -> tuple[PhotoReading, ...]:
-    """Return the readings of photographs, in their order.
+    """Return the readings of photographs, in the order of the photographs.
 
     Parameters
     ----------
@@ -506,7 +509,7 @@ def _digest(camera: LedCamera, stand: MirrorPoses) -> bytes:
 
 
 def _mark(photo: Photo, base: bytes) -> str:
-    """Return a key for a photograph's file, position and attitude with this camera and field."""
+    """Return a key that identifies a photograph's file, position, attitude, camera and field."""
     state = photo.path.stat() if photo.path is not None and photo.path.exists() else None
     recorded = photo.position.tobytes() + photo.rotation.tobytes() + bytes([photo.by_hand])
     file = "" if state is None else f"{photo.name} {state.st_size} {state.st_mtime_ns}"
@@ -519,5 +522,5 @@ def _kept(path: Path) -> PhotoReading | None:
     try:
         return PhotoReading.load(path)
     except (InputError, ValueError):
-        # Written by another version, or damaged: read the photograph again.
+        # The file was written by another version, or is damaged, so read the photograph again.
         return None

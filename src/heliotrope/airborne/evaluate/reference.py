@@ -1,4 +1,4 @@
-"""Compares orientations with a reference: tables 3 to 5 of HelioPoint.
+"""Compare orientations with a reference, as in HelioPoint's tables 3 to 5.
 
 A reference is the normal of a heliostat in the same pose, measured by another method
 (deflectometry, QDec-H). The same reflections are evaluated with the ideal surface and, if a slope
@@ -27,30 +27,30 @@ SURFACES = ("ideal", "measured")
 
 @dataclass(frozen=True)
 class Reference:
-    """Normals of heliostats by another method.
+    """Heliostat normals measured by another method.
 
     Attributes
     ----------
     normals
-        Unit normals, ENU, by flight ("" for every flight) and heliostat.
+        Unit normals, ENU, keyed by flight ("" for every flight) and heliostat.
     """
 
     normals: dict[tuple[str, str], FloatArray]
 
     def of(self, flight: str, heliostat: str) -> FloatArray | None:
-        """Return the normal in a flight, (3,); None if it is not known."""
+        """Return the normal of a heliostat in a flight, (3,); None if it is not known."""
         own = self.normals.get((flight, heliostat))
         return self.normals.get(("", heliostat)) if own is None else own
 
 
 def read_reference(path: str | Path) -> Reference:
-    """Return the reference of a table (CSV).
+    """Return the reference from a CSV table.
 
     Parameters
     ----------
     path
-        Columns heliostat, azimuth_deg (clockwise from north) and elevation_deg of the normal, and
-        flight where a campaign has several.
+        CSV file with the columns heliostat, azimuth_deg (clockwise from north) and elevation_deg of
+        the normal, and the column flight if the campaign has several flights.
 
     Raises
     ------
@@ -82,13 +82,13 @@ class Compared:
     Attributes
     ----------
     label
-        Name, preceded by that of the flight if there are several.
+        Name of the heliostat, preceded by the name of the flight if there are several.
     reference
         Unit normal, ENU, (3,).
     shape
-        Its surface, with the slope map if there is one.
+        Surface of the heliostat, with the slope map if there is one.
     ideal, measured
-        Orientations with the ideal and with the measured surface; None without a slope map, or if
+        Orientations with the ideal and with the measured surface; None if there is no slope map or
         the evaluation failed.
     """
 
@@ -99,7 +99,7 @@ class Compared:
     measured: Orientation | None
 
     def offset(self, surface: str) -> FloatArray:
-        """Return rotX and rotY from the reference to the result, rad (2,); NaN without a result."""
+        """Return rotX and rotY from the reference to the result, rad, (2,); NaN if no result."""
         orientation: Orientation | None = getattr(self, surface)
         if orientation is None:
             return np.full(2, np.nan)
@@ -107,7 +107,7 @@ class Compared:
 
 
 def offset_from(reference: FloatArray, orientation: Orientation) -> FloatArray:
-    """Return rotX and rotY that turn a reference normal into the measured one, rad, (2,)."""
+    """Return rotX and rotY that rotate the reference normal into the measured one, rad, (2,)."""
     axis = np.cross(reference, orientation.normal)
     sine = float(np.linalg.norm(axis))
     angle = np.arctan2(sine, float(reference @ orientation.normal))
@@ -160,18 +160,18 @@ def _evaluated(flight: FlightResult, *, slopes: bool) -> Orientations:
 
 @dataclass(frozen=True)
 class Offsets:
-    """Offsets to the reference of M heliostats with one surface.
+    """Offsets of M heliostats from the reference, evaluated with one kind of surface.
 
     Attributes
     ----------
     mean, spread
-        Of rotX and rotY, rad, (2,); the spread is the standard deviation about the mean.
+        Mean of rotX and rotY, and their standard deviation about the mean, rad, (2,).
     rms
-        Of rotX and rotY about 0, rad, (2,).
+        RMS of rotX and rotY about 0, rad, (2,).
     count
         M.
     within
-        Share of components within 1.645 σ_tot: 0.9 if σ_tot is right.
+        Fraction of components within 1.645 σ_tot, which is 0.9 if σ_tot is right.
     """
 
     mean: FloatArray
@@ -198,7 +198,7 @@ def offsets(compared: Sequence[Compared], surface: str) -> Offsets | None:
 
 
 def reference_rows(compared: Sequence[Compared]) -> list[dict[str, Any]]:
-    """Return one record for each heliostat: offsets (table 3), azimuth and elevation (4 and 5)."""
+    """Return one record per heliostat: offsets (table 3), azimuth and elevation (tables 4, 5)."""
     rows = []
     for pair in compared:
         row: dict[str, Any] = {"heliostat": pair.label}
@@ -215,14 +215,14 @@ def reference_rows(compared: Sequence[Compared]) -> list[dict[str, Any]]:
                 ("azimuth", "elevation"), azimuth_elevation(normal), angles, strict=True
             ):
                 row[f"{word}_{surface}_deg"] = float(np.degrees(angle))
-                # As in the paper: the difference of the angles, not of the directions.
+                # As in the paper, this is the difference of the angles, not of the directions.
                 row[f"{word}_{surface}_off_mrad"] = 1e3 * float(wrap_signed(angle - at))
         rows.append(row)
     return rows
 
 
 def reference_document(compared: Sequence[Compared]) -> dict[str, Any]:
-    """Return the comparison as a record for JSON; empty without one."""
+    """Return the comparison as a JSON object; empty if there was no comparison."""
     if not compared:
         return {}
     document: dict[str, Any] = {"reference": reference_rows(compared), "reference_offsets": {}}

@@ -19,10 +19,10 @@ _COLOURS = (AFTER, TESTED)
 def sampling_figure(compared: Compared) -> "Figure":
     """Return the picture of one heliostat.
 
-    Above, the angular differences about x (left) and y (right) by the ideal surface; in the middle
-    by the measured one; below, the measured slope deviations SDy and SDx in mrad, with the sampling
-    points. SDy corresponds to rotations about x. Without a slope map the second row says so,
-    and the last shows the sampling points alone.
+    The top row shows the angular differences about x (left) and y (right) with the ideal surface,
+    and the middle row with the measured surface. The bottom row shows the measured slope deviations
+    SDy and SDx in mrad, with the sampling points; SDy corresponds to rotations about x. If there is
+    no slope map, the middle row says so, and the bottom row shows only the sampling points.
     """
     figure, axes = figure_of(3, 2, (9.0, 10.5))
     figure.suptitle(compared.label)

@@ -1,4 +1,4 @@
-"""The page and the table that compare orientations with a reference."""
+"""Write the page and the table that compare orientations with a reference."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,14 +12,14 @@ from heliotrope.airborne.evaluate.tables import write_table
 from heliotrope.files.html import STYLE, picture, render
 from heliotrope.files.text import write_text
 
-#: Most heliostats with a picture.
+#: Maximum number of heliostats with a picture.
 MOST_PICTURES = 60
 
 Table = dict[str, Sequence[Any]]
 
 
 def write_reference(compared: Sequence[Compared], folder: Path, *, page: bool = True) -> None:
-    """Write ``reference.csv`` and, unless declined, ``reference.html`` with its pictures."""
+    """Write ``reference.csv`` and, if ``page`` is true, ``reference.html`` with its pictures."""
     folder.mkdir(parents=True, exist_ok=True)
     write_table(folder / "reference.csv", reference_rows(compared))
     if not page:
@@ -43,7 +43,7 @@ def write_reference(compared: Sequence[Compared], folder: Path, *, page: bool = 
 
 
 def offset_table(compared: Sequence[Compared]) -> Table:
-    """Return header and rows of table 3, with mean, spread and RMS at the end; mrad."""
+    """Return the header and rows of table 3, mrad, with the mean, spread and RMS at the end."""
     head = ["heliostat", *(f"{s}, {a}" for s in SURFACES for a in ("rotX", "rotY"))]
     rows = [
         [row["heliostat"], *(_cell(row[f"rot_{a}_{s}_mrad"]) for s in SURFACES for a in "xy")]
@@ -60,7 +60,7 @@ def offset_table(compared: Sequence[Compared]) -> Table:
 
 
 def _angles(compared: Sequence[Compared], which: str) -> Table:
-    """Return header and rows of table 4 (azimuth) or 5 (elevation)."""
+    """Return the header and rows of table 4 (azimuth) or table 5 (elevation)."""
     head = ["heliostat", "reference, °"]
     head += [f"{s}, {what}" for s in SURFACES for what in ("°", "deviation, mrad")]
     rows = []

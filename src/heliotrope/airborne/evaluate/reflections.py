@@ -1,7 +1,7 @@
 """Reflections of the drone's lamp found in the images: the reflection table of a flight.
 
 One record is one reflection in one photograph. The mirror orientations are computed from this table
-alone; the images are no longer needed.
+alone, without the images.
 """
 
 from collections.abc import Sequence
@@ -62,12 +62,12 @@ class Reflections:
     def take(self, rows: npt.ArrayLike) -> "Reflections":
         """Return the reflections at indices ``rows`` (or a mask), in that order."""
         index = np.asarray(rows)
-        # NumPy makes an empty list an array of floats.
+        # NumPy turns an empty list into an array of floats.
         index = index if index.size else index.astype(np.intp)
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     def of(self, heliostat: int) -> "Reflections":
-        """Return the reflections of one heliostat; its index is kept."""
+        """Return the reflections of one heliostat, with its index unchanged."""
         return self.take(np.flatnonzero(self.heliostat == heliostat))
 
 
@@ -80,7 +80,7 @@ def reflections(
     led: npt.ArrayLike,
     sigma: npt.ArrayLike,
 ) -> Reflections:
-    """Return checked reflections; everything broadcasts to the N rows of ``xy`` (N, 2).
+    """Return checked reflections; all arguments broadcast to the N rows of ``xy`` (N, 2).
 
     Raises
     ------
@@ -123,7 +123,7 @@ def reflections(
 
 
 def join(parts: Sequence[Reflections]) -> Reflections:
-    """Join several tables, in the order given; without parts the table is empty."""
+    """Join several tables in order; without any tables the result is empty."""
     if not parts:
         return reflections([], [], [], np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3)), [])
     return Reflections(
@@ -134,12 +134,12 @@ def join(parts: Sequence[Reflections]) -> Reflections:
 def write_reflections(path: str | Path, found: Reflections, names: Sequence[str]) -> None:
     """Write reflections as ``.csv`` or ``.parquet``, completely or not at all.
 
-    Columns: photo, heliostat (name), facet, x_m, y_m, camera_east_m …, led_up_m, sigma_m.
+    The columns are photo, heliostat (name), facet, x_m, y_m, camera_east_m …, led_up_m, sigma_m.
 
     Raises
     ------
     InputError
-        If the suffix is neither of the two, or an index has no name in ``names``.
+        If the suffix is neither ``.csv`` nor ``.parquet``, or an index has no name in ``names``.
     """
     import pandas as pd
 

@@ -1,4 +1,4 @@
-"""The flight report: one self-contained page, and tables for other programs."""
+"""Write the flight report: one self-contained page, and tables for other programs."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int, int], None]
 
-#: Most flights with a map, and most heliostats with a picture.
+#: Maximum numbers of flights with a map and of heliostats with a picture.
 MOST_MAPS, MOST_SECTIONS = 6, 60
 _AVERAGED = ("sigma", "sigma_plain", "sigma_mean")
 _FLIGHT_HEAD = (
@@ -57,8 +57,9 @@ def write_result(
 ) -> None:
     """Write the reflections, sightings and orientations of evaluated flights to a folder.
 
-    ``reflections.csv`` (for a campaign ``reflections-FLIGHT.csv``), ``sightings.csv`` for the
-    calibration, ``flight.json`` for a running plant, and the report of `write_campaign_report`.
+    The files are ``reflections.csv`` (for a campaign ``reflections-FLIGHT.csv``), ``sightings.csv``
+    for the calibration, ``flight.json`` for a running plant, and the report of
+    `write_campaign_report`.
 
     Parameters
     ----------
@@ -105,8 +106,8 @@ def write_flight_report(
 ) -> Path:
     """Write the page and the tables of one flight, and return the path of the page.
 
-    ``index.html`` (with all plots), ``orientations``, ``facets``, ``flights`` and ``differences``
-    as ``.csv`` and ``.parquet``, and ``reflections.parquet``.
+    The files are ``index.html`` (with all plots), ``orientations``, ``facets``, ``flights`` and
+    ``differences`` as ``.csv`` and ``.parquet``, and ``reflections.parquet``.
 
     Parameters
     ----------
@@ -202,7 +203,7 @@ def _write_tables(flights: Sequence[MeasuredFlight], folder: Path) -> None:
         for suffix in (".csv", ".parquet"):
             write_table(folder / f"{name}{suffix}", rows)
     for f in flights:
-        # Photographs are numbered within their flight.
+        # Photograph numbers count from 0 within each flight.
         name = f"reflections-{f.name}" if f.name else "reflections"
         own = join([o.reflections for o in f.found.found])
         write_reflections(folder / f"{name.replace('/', '-')}.parquet", own, f.found.names)
@@ -275,7 +276,7 @@ def _of_heliostats(flights: Sequence[MeasuredFlight], shown: set[str]) -> _Table
 
 
 def _causes(flights: Sequence[MeasuredFlight]) -> list[str]:
-    """Return the causes of the systematic part that are known for every flight."""
+    """Return the causes of the systematic error that are known for every flight."""
     if any(f.budget is None for f in flights):
         return []
     without = {f.places is None for f in flights}

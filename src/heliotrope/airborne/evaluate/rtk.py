@@ -1,8 +1,8 @@
-"""RTK positions compared with photogrammetry, following appendix A of HelioPoint.
+"""Compare RTK positions with photogrammetry, following HelioPoint's appendix A.
 
 In the paper, a flight photographs coded targets on the ground (`check_rtk_by_targets`). Any flight
-over the field shows mirrors, but their edges are accurate only to millimetres (`check_rtk`, our own
-method).
+over the field can be checked by its mirrors instead, although their edges are accurate only to
+millimetres (`check_rtk`, our own method).
 """
 
 from collections.abc import Sequence
@@ -20,13 +20,13 @@ from heliotrope.airborne.standing import MirrorPoses
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
 
-#: Standard deviations that are tried, and the 95 % point of chi-square with one degree of freedom.
+#: Trial standard deviations, and the 95 % point of chi-square with one degree of freedom.
 _TRIALS, _CHI2_95 = 4001, 3.841
 
 
 @dataclass(frozen=True)
 class RtkCheck:
-    """RTK positions compared with those from photogrammetry.
+    """Comparison of RTK positions with positions from photogrammetry.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class RtkCheck:
         Standard deviation of a single position from RTK alone, m, (3,); 0 if photogrammetry
         explains the whole difference.
     rtk_range
-        Its 95 % interval, lower and upper bound, m, (2, 3).
+        Lower and upper bound of the 95 % interval of ``rtk``, m, (2, 3).
     """
 
     names: tuple[str, ...]
@@ -71,10 +71,10 @@ def check_rtk(
     stand: MirrorPoses,
     priors: Priors | None = None,
 ) -> tuple[RtkCheck, tuple[str, ...]]:
-    """Return the scatter of RTK positions about those from the images alone.
+    """Return the scatter of RTK positions about positions from the images alone.
 
-    The adjustment runs twice: in the usual form, for the common offset, and with positions free
-    within a metre, for the error of each photograph.
+    The adjustment runs twice. The usual form yields the common offset; a second one, with positions
+    free within a metre, yields the error of each photograph.
 
     Raises
     ------
@@ -97,7 +97,8 @@ def check_rtk(
         usual.state.rotation,
         usual.state.stand,
         corners,
-        # The mirrors stay where the first adjustment put them: their errors are not RTK's.
+        # The mirrors stay where the first adjustment placed them, because their errors are not due
+        # to RTK.
         Priors(offset=1e-6, position=1e-6, turn=1e-6),
     )
     gap = places - free.state.position
@@ -115,7 +116,7 @@ def check_rtk(
 def check_rtk_by_targets(
     photos: Sequence[Photo], targets: Sequence[SeenTargets], camera: LedCamera
 ) -> tuple[RtkCheck, Photogrammetry, tuple[str, ...]]:
-    """Return the scatter of RTK positions about those from coded targets, as in appendix A.
+    """Return the scatter of RTK positions about positions from coded targets (appendix A).
 
     The photogrammetric positions are fitted to the RTK positions by a similarity transform, so a
     common offset, rotation or scale cannot be determined.
@@ -155,16 +156,18 @@ def check_rtk_by_targets(
 
 
 def share_of_rtk(gap: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the scatter of RTK alone, without that of photogrammetry, and its 95 % interval.
+    """Return the scatter of RTK without that of photogrammetry, and its 95 % interval.
 
-    Restricted maximum likelihood for each axis: a difference has the variance of RTK, which is
-    the same for all, and that of its own photograph; their mean is unknown. (Ours; the paper's
-    photogrammetry with coded targets was good to less than a millimetre and is neglected there.)
+    The scatter is estimated by restricted maximum likelihood for each axis. The variance of a
+    difference is that of RTK, which is the same for all photographs, plus that of the
+    photogrammetry for this photograph. The mean of the differences is unknown. (This method is
+    ours; the photogrammetry in the paper, with coded targets, was good to less than a millimetre
+    and is neglected there.)
 
     Parameters
     ----------
     gap
-        RTK minus photogrammetry, m, (P, 3), P at least 3.
+        RTK minus photogrammetry, m, (P, 3), with P at least 3.
     sigma
         Standard deviations of the photogrammetric positions, m, (P, 3).
 

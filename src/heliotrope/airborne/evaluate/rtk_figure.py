@@ -1,4 +1,4 @@
-"""Figure 8 of HelioPoint: relative errors of RTK positions along x, y, z."""
+"""HelioPoint's figure 8: relative errors of RTK positions along x, y, z."""
 
 import numpy as np
 
@@ -10,10 +10,10 @@ _WIDTH, _HEIGHT, _STEP = 250.0, 210.0, 320.0
 
 
 def rtk_drawing(check: RtkCheck) -> str:
-    """Return RTK minus photogrammetry as SVG: a histogram for each axis, about its mean.
+    """Return histograms, as SVG, of RTK minus photogrammetry about the mean for each axis.
 
-    The curve is the normal distribution of the differences' standard deviation; the title gives the
-    standard deviation of RTK alone.
+    The curve is a normal distribution with the standard deviation of the differences; the title
+    states the standard deviation of RTK alone.
     """
     gap = 1e3 * (check.difference - check.difference.mean(axis=0))
     low, high = around(gap)

@@ -1,13 +1,14 @@
-r"""Orientations measured by a drone, converted to sightings for the calibration.
+r"""Convert orientations measured by a drone to sightings for the calibration.
 
 The rays of a sighting meet at the mirror vertex, but a reflection may lie anywhere on the mirror,
 on a canted facet. Both rays are therefore moved to the vertex and rotated from the normal measured
-at the point to the normal that the whole mirror would have if this point were right. The distances
-stay the same, and bisector and lever arm are those of the reflection.
+at the point to the normal that the whole mirror would have if this measurement were exact. The
+distances, the bisector and the lever arm remain those of the reflection.
 
-Unmapped slope deviations make a mirror appear rotated, to the drone, by the same angle in all
-poses. The centroid of a mirror's image on a target, in contrast, represents the mean over the whole
-mirror. In a joint fit, that rotation is an additional unknown (`fit_together`).
+Without a slope map, slope deviations make a mirror appear rotated to the drone, by the same angle
+in all poses. The centroid of a mirror's image on a target, in contrast, represents the mean over
+the whole mirror. In a joint fit of both, the apparent rotation is therefore an additional unknown
+(`fit_together`).
 """
 
 from collections.abc import Mapping
@@ -30,11 +31,11 @@ from heliotrope.sun import Times, unix_seconds
 #: One sighting for each reflection, or for each orientation.
 Per = Literal["reflection", "orientation"]
 
-# Standard deviation of the turn of a mirror that was not flown, rad.
+# Standard deviation of the apparent rotation of a mirror that no flight has measured, rad.
 _UNTOLD = 1e-3
-# Degrees of freedom from which the scatter of the poses is estimated.
+# The scatter of the poses is estimated if there are at least this many degrees of freedom.
 _ENOUGH = 8
-# Least scatter, as a share of the stated standard deviation.
+# Minimum scatter, as a fraction of the stated standard deviation.
 _LEAST = 0.1
 
 
@@ -53,28 +54,28 @@ def to_sightings(
     orientations
         Orientations of the N heliostats.
     counts
-        Counts of their drives in this pose, (N, D).
+        Drive counts of the heliostats in this pose, (N, D).
     time
-        See `heliotrope.sun.Times`, () or (N,); NaN: unknown.
+        See `heliotrope.sun.Times`, () or (N,); NaN if unknown.
     per
-        "reflection" creates a sighting per reflection that is not an outlier, "orientation" one per
-        orientation.
+        "reflection" creates one sighting per reflection that is not an outlier; "orientation"
+        creates one sighting per orientation.
     systematic
         Whether σ includes the error common to all points of a mirror. Exclude it if the fit
         estimates the positions, which cause the larger part of that error.
 
     Returns
     -------
-    Sightings whose σ gives all sightings of an orientation together the weight of σ_tot (or
-    σ_mean), however many there are; single reflections share it as in the mean over the mirror.
-    Both choices of ``per`` give the same fit, and single reflections allow the fit to find its own
-    outliers.
+    Sightings. Their σ is such that all sightings of an orientation together have the weight that
+    follows from σ_tot (or σ_mean), however many there are. Reflections share this weight as in the
+    mean over the mirror. Both choices of ``per`` produce the same fit, but with single reflections
+    the fit can find outliers by itself.
 
     Raises
     ------
     InputError
-        If there is no orientation, the counts are not those of N heliostats, or ``per`` has another
-        value.
+        If there is no orientation, the counts are not those of N heliostats, or ``per`` has a
+        different value.
     """
     if per not in ("reflection", "orientation"):
         raise InputError(f"to_sightings: per={per!r}; use 'reflection' or 'orientation'")
@@ -101,14 +102,15 @@ def mean_sigma(o: Orientation, *, systematic: bool = False) -> float:
 
 
 def _of_mean(o: Orientation, counts: FloatArray, time: float, systematic: bool) -> Sightings:
-    # With the lamp in the camera, on the normal, the ray turns by twice the error of the normal.
+    # If the lamp is at the camera, on the normal, the ray rotates by twice the error of the normal.
     place = o.vertex + o.distance * o.normal
     sigma = 2.0 * mean_sigma(o, systematic=systematic)
     return drone([o.heliostat], counts[None], place, place, time=time, sigma=sigma)
 
 
 def _of_points(o: Orientation, counts: FloatArray, time: float, systematic: bool) -> Sightings:
-    # Kriging weights of points behind others may be negative: a tenth of the mean is the least.
+    # Kriging weights of points behind other points may be negative, so they are limited to at least
+    # a tenth of the mean weight.
     share = np.maximum(o.weight, 0.1 / max(o.count, 1))
     kept = np.flatnonzero(~o.outlier)
     share = share[kept] / share[kept].sum()
@@ -145,10 +147,10 @@ class Together:
     calibration
         Calibration of N heliostats. Its covariance accounts for the unknown rotation.
     turn
-        Rotation by which each mirror appears turned to the drone in all poses, about the
+        Rotation that each mirror appears to have to the drone in all poses, about the
         concentrator's x and y axes, rad, (N, 2).
     turn_covariance
-        Its covariance, rad², (N, 2, 2).
+        Covariance of ``turn``, rad², (N, 2, 2).
     noise
         Scatter of the poses apart from the rotation, in units of the drone sightings' sigma, (N,);
         1 if there are too few poses to estimate it.
@@ -168,12 +170,13 @@ def fit_together(
     *,
     priors: Mapping[str, npt.ArrayLike] | None = None,
 ) -> Together:
-    """Fit drone sightings and others jointly, for mirrors without slope maps.
+    """Fit drone sightings and other sightings jointly, for mirrors without slope maps.
 
-    A rotation of each mirror common to all its poses is an additional unknown. Its prior is as wide
-    as the stated standard deviation of the drone sightings (half of their sigma, which refers to
-    the beam), and their remaining error is estimated from their scatter about a separate fit. The
-    loss is quadratic, so outliers must be removed beforehand.
+    An apparent rotation of each mirror, common to all its poses, is an additional unknown. Its
+    prior is as wide as the stated standard deviation of the mirror normal in the drone sightings
+    (half of their sigma, which refers to the beam). The remaining error of the drone sightings is
+    estimated from their scatter about a separate fit. The loss is quadratic, so outliers must be
+    removed beforehand.
 
     Parameters
     ----------
@@ -182,7 +185,7 @@ def fit_together(
     others
         Camera-target sightings, in which a centroid represents the mean over the whole mirror.
     flights
-        One per orientation (``per="orientation"``), without the systematic part.
+        Drone sightings, one per orientation (``per="orientation"``), without the systematic part.
     model, priors
         See `heliotrope.calibration.fit.estimator.fit`.
 
@@ -195,7 +198,8 @@ def fit_together(
     -----
     In simulation (4 facets, slopes 0.8 mrad, 5 camera-target and 15 drone sightings, 24 mirrors),
     normals in other poses are predicted to 0.77 mrad from the camera-target sightings alone, 0.16
-    from the drone sightings alone, 0.16 from both in `estimator.fit`, and 0.08 by this function.
+    mrad from the drone sightings alone, 0.16 mrad from both with `estimator.fit`, and 0.08 mrad
+    with this function.
     """
     alone = fit(mechanism, flights, model, priors=priors, loss="square", adapt_scale=False)
     count = len(mechanism)
@@ -222,14 +226,14 @@ def fit_together(
 
 
 def _shared_spread(flights: Sightings, count: int) -> FloatArray:
-    """Return the standard deviation of the turn of each mirror's normal, rad, (N,)."""
+    """Return the standard deviation of the apparent rotation of each normal, rad, (N,)."""
     number = np.bincount(flights.heliostat, minlength=count)
     square = np.bincount(flights.heliostat, weights=flights.sigma**2, minlength=count)
     return np.where(number > 0, 0.5 * np.sqrt(square / np.maximum(number, 1)), _UNTOLD)
 
 
 def _scatter(alone: FieldFit, flights: Sightings) -> FloatArray:
-    """Return the scatter of poses about their own fit, in units of their sigma, (N,)."""
+    """Return the scatter of poses about a fit to these poses, in units of their sigma, (N,)."""
     count = len(alone.values)
     free = 2 * np.bincount(flights.heliostat, minlength=count) - len(alone.names)
     square = np.bincount(flights.heliostat, weights=alone.lengths**2, minlength=count)

@@ -2,8 +2,8 @@ r"""Outliers, normality, and the accuracy of a mean over points on a mirror.
 
 The plain estimate, σ/√n, treats the differences at n points as independent samples. They are not
 independent, because the slope deviations of a mirror are one fixed, smooth field, and points spread
-over the field average it better than random samples would. With the covariance C of the field, the
-error of the mean over the points relative to the mean over the mirror V is
+over the mirror average this field better than random samples would. With the covariance C of the
+field, the error of the mean over the points relative to the mean over the mirror V is
 
 $$ σ_E^2 = \bar C(x, x) - 2 \bar C(x, V) + \bar C(V, V) + τ^2 / n $$
 
@@ -11,8 +11,9 @@ $$ σ_E^2 = \bar C(x, x) - 2 \bar C(x, V) + \bar C(V, V) + τ^2 / n $$
 *Geostatistics*, section 2.6), where τ is the noise of one point. The field is modelled as Gaussian
 with a Matérn covariance of smoothness 3/2, the same on all facets and independent between facets,
 so that canting errors are included. Variance, correlation length and noise are estimated from the
-differences by restricted maximum likelihood, averaged over all lengths and noise ratios by their
-likelihood, since one mirror contains little information on either.
+differences by restricted maximum likelihood, and the result is averaged over all lengths and noise
+ratios, weighted by their likelihood, because one mirror contains little information on either of
+them.
 """
 
 from dataclasses import dataclass
@@ -29,34 +30,34 @@ from heliotrope.geometry import FloatArray, as_float
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
 
-#: Probability of a false alarm of Rosner's test.
+#: False-alarm probability of Rosner's test.
 ALPHA = 0.05
-#: Largest share of outliers.
+#: Largest fraction of the points that may be outliers.
 SHARE = 0.2
-#: Fewer points than this cannot show a field.
+#: With fewer points than this, the field cannot be estimated.
 FIELD = 8
-#: What is known of the scatter of a mirror's differences before it is measured, rad: with the
-#: designed surface and with a slope map, as in HelioPoint (0.8 expected, 0.2 in its figure 6).
+#: Prior scatter of a mirror's differences, rad, with the designed surface and with a slope map, as
+#: in HelioPoint (0.8 mrad expected, 0.2 mrad in its figure 6).
 SCATTER, SCATTER_WITH_MAP = 0.8e-3, 0.2e-3
-#: That knowledge counts like this many degrees of freedom.
+#: The prior counts as this many degrees of freedom.
 PRIOR_FREEDOM = 8.0
-# Trial correlation lengths, as shares of a facet's diagonal, and trial ratios τ²/s².
+# Trial correlation lengths, as fractions of a facet's diagonal, and trial ratios τ²/s².
 _LENGTHS = np.geomspace(0.04, 1.2, 8)
 _RATIOS = np.geomspace(1e-3, 1e2, 11)
-# Points along an edge of a facet that represent its area. Two grids without common points, so
-# that pairs of a point with itself do not raise the mean of C over pairs.
+# Numbers of grid points along an edge of a facet, which represent its area. The two grids have no
+# common points, so that pairs of a point with itself do not raise the mean of C over pairs.
 _AREA = (9, 8)
 
 
 def rosner(values: npt.ArrayLike, *, alpha: float = ALPHA) -> npt.NDArray[np.bool_]:
-    """Return the mask of outliers among n values: generalised extreme Studentized deviates.
+    """Return a mask of outliers among n values by the generalised ESD test.
 
     Parameters
     ----------
     values
-        (n,), normally distributed but for the outliers.
+        Values, (n,), normally distributed except for the outliers.
     alpha
-        Probability of calling any of n good values an outlier.
+        Probability that any of n good values is called an outlier.
 
     Raises
     ------
@@ -65,15 +66,15 @@ def rosner(values: npt.ArrayLike, *, alpha: float = ALPHA) -> npt.NDArray[np.boo
 
     Notes
     -----
-    Rosner 1983, Technometrics 25, 165-172. Mean and standard deviation are the values' own;
-    `heliotrope.calibration.learn.outliers.generalised_esd` is the test for a known
-    covariance.
+    The test is that of Rosner 1983, Technometrics 25, 165-172. Mean and standard deviation are
+    estimated from the values; for a known covariance use
+    `heliotrope.calibration.learn.outliers.generalised_esd`.
     """
     if not 0.0 < alpha < 1.0:
         raise InputError(f"alpha must be between 0 and 1, not {alpha}")
     data = as_float(values)
     mask = np.zeros(len(data), dtype=np.bool_)
-    # Rosner's critical values are accurate from n = 15, and need two values that remain.
+    # Rosner's critical values are accurate from n = 15, and require that two values remain.
     most = min(int(np.ceil(SHARE * len(data))), len(data) - 3)
     if most < 1:
         return mask
@@ -87,7 +88,7 @@ def rosner(values: npt.ArrayLike, *, alpha: float = ALPHA) -> npt.NDArray[np.boo
 def studentized_deviates(
     values: npt.ArrayLike, most: int, alpha: float = ALPHA
 ) -> tuple[npt.NDArray[np.intp], FloatArray, FloatArray]:
-    """Return rows, extreme Studentized deviates R and critical values λ, (most,) each.
+    """Return indices, extreme Studentized deviates R and critical values λ, each (most,).
 
     Rosner 1983, (2.1) and (2.5): the value farthest from the mean is removed ``most`` times.
     """
@@ -102,7 +103,7 @@ def studentized_deviates(
         spread = float(part.std(ddof=1))
         away = np.abs(part - part.mean())
         k = int(np.argmax(away))
-        # Equal values have no extreme one.
+        # If all values are equal, none is extreme.
         extreme[i] = away[k] / spread if spread > 0.0 else 0.0
         which[i] = remaining[k]
         remaining = np.delete(remaining, k)
@@ -113,7 +114,7 @@ def studentized_deviates(
 
 
 def normality(values: npt.ArrayLike) -> float:
-    """Return the p value of Shapiro and Wilk's test; NaN for fewer than 3 or equal values."""
+    """Return the p-value of the Shapiro-Wilk test; NaN for fewer than 3 values or equal values."""
     from scipy.stats import shapiro
 
     data = as_float(values)
@@ -123,7 +124,7 @@ def normality(values: npt.ArrayLike) -> float:
 
 
 def plain_sigma(values: npt.ArrayLike) -> FloatArray:
-    """Return σ/√n of each column of (n, c) values, (c,); NaN for fewer than 2."""
+    """Return σ/√n of each column of values (n, c), (c,); NaN if n is less than 2."""
     data = as_float(values)
     if len(data) < 2:
         return np.full(data.shape[1:], np.nan)
@@ -133,10 +134,10 @@ def plain_sigma(values: npt.ArrayLike) -> FloatArray:
 def few_sigma(values: npt.ArrayLike, prior: float) -> FloatArray:
     """Return the standard deviation of the mean of a few values (n, c), n ≥ 1, (c,).
 
-    The variance of few values says little, so it is combined with a prior (scaled inverse χ² with
-    `PRIOR_FREEDOM` degrees of freedom about ``prior``², Gelman et al. 2013, *Bayesian Data
-    Analysis*, section 3.3). The mean then has Student's distribution; what is returned is the
-    standard deviation of the normal distribution with the same 90 % ellipse of two components.
+    The variance of a few values is poorly known, so it is combined with a prior (scaled inverse χ²
+    with `PRIOR_FREEDOM` degrees of freedom about ``prior``², Gelman et al. 2013, *Bayesian Data
+    Analysis*, section 3.3). The mean then has Student's distribution. The returned value is the
+    standard deviation of the normal distribution that has the same 90 % ellipse in two components.
     """
     from scipy.stats import f as fisher
 
@@ -163,9 +164,9 @@ class SpreadMean:
     sigma_weighted
         Standard deviation of that weighted mean, (c,).
     length
-        Correlation length, m: mean over the likelihood.
+        Correlation length, m, averaged with the likelihood as weight.
     noise
-        Share of the variance that is noise rather than field: τ² / (s² + τ²).
+        Fraction of the variance that is noise rather than field, τ² / (s² + τ²).
     """
 
     sigma: FloatArray
@@ -187,17 +188,18 @@ def spread_mean(
     Parameters
     ----------
     values
-        (n, c): differences at the points, rad.
+        Differences at the points, rad, (n, c).
     shape
         Shape of the mirror.
     facet, uv
         Facet of each point, (n,), and its position along the facet's axes, m, (n, 2).
     prior
-        Prior scatter of the values, rad, see `few_sigma`.
+        Prior scatter of the values, rad; see `few_sigma`.
 
     Returns
     -------
-    For fewer than `FIELD` points, which cannot show a field, the plain mean and `few_sigma`.
+    The mean. With fewer than `FIELD` points the field cannot be estimated, so the result is the
+    plain mean with the standard deviation of `few_sigma`.
     """
     data, k, place = as_float(values), np.asarray(facet, dtype=np.intp), as_float(uv)
     n = len(data)
@@ -210,7 +212,7 @@ def spread_mean(
 
 @lru_cache(maxsize=1)
 def _one_thread() -> "ThreadpoolController":
-    """Return a thread limit; a mirror's matrices are too small for several threads."""
+    """Return a limit of one thread, because a mirror's matrices are too small for several."""
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
@@ -249,7 +251,7 @@ def _spread_mean(
 
 
 def matern(distance: npt.ArrayLike) -> FloatArray:
-    """Return Matérn's correlation of smoothness 3/2 at distances in correlation lengths."""
+    """Return the Matérn correlation of smoothness 3/2 at distances in correlation lengths."""
     h = np.sqrt(3.0) * as_float(distance)
     return as_float((1.0 + h) * np.exp(-h))
 
@@ -289,14 +291,14 @@ def _apart(half_width: float, half_height: float) -> FloatArray:
 
 
 def _grid(count: int) -> FloatArray:
-    """Return the middles of count × count cells of the square from −1 to 1, (count², 2)."""
+    """Return the centres of count × count cells of the square from −1 to 1, (count², 2)."""
     line = (2.0 * np.arange(count) + 1.0) / count - 1.0
     return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """All noise ratios at one correlation length.
+    """Results for all noise ratios at one correlation length.
 
     Attributes
     ----------

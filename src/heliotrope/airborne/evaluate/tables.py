@@ -25,15 +25,15 @@ class MeasuredFlight:
     Attributes
     ----------
     name
-        Name of the flight; empty if it is the only one.
+        Name of the flight; empty if it is the only flight.
     found
         Orientations of the N heliostats.
     shape
-        Function that returns the mirror at an index.
+        Function that returns the mirror, given its index.
     position
         Positions of the heliostats, ENU metres, (N, 3).
     budget
-        If specified, the systematic part is split by cause.
+        Error budget by which the systematic part is split by cause; None for no split.
     places
         Covariances of the mirrors' positions relative to the drone, m², (N, 3, 3), or None.
     """
@@ -68,16 +68,16 @@ def orientation_rows(
     flight: str = "",
     places: npt.ArrayLike | None = None,
 ) -> list[dict[str, Any]]:
-    """Return one record for each heliostat, for tables and JSON; angles in mrad and degrees.
+    """Return one record per heliostat for tables and JSON, with angles in mrad and degrees.
 
     Parameters
     ----------
     orientations
         Orientations of one flight.
     budget
-        If given, the systematic part is also split by cause.
+        Error budget by which the systematic part is also split by cause; None for no split.
     flight
-        Its name, for a column of that name; no column if "".
+        Name of the flight, for the column ``flight``; if empty, there is no such column.
     places
         See `heliotrope.airborne.evaluate.orientation.measure_field`, (N, 3, 3).
     """
@@ -89,7 +89,7 @@ def orientation_rows(
 
 
 def facet_rows(orientations: Orientations, flight: str = "") -> list[dict[str, Any]]:
-    """Return one record for each facet: its mean difference is its canting error, mrad."""
+    """Return one record per facet; its mean difference is its canting error, mrad."""
     return [
         {
             **_of(flight),
@@ -125,8 +125,8 @@ def difference_rows(orientations: Orientations, flight: str = "") -> list[dict[s
 def flight_row(orientations: Orientations, flight: str = "") -> dict[str, Any]:
     """Return the record of a flight: counts, and means over its heliostats, mrad.
 
-    ``rot_mean`` is the mean deviation, common to all; ``rot_rms`` their size. The standard
-    deviations are root mean squares.
+    ``rot_mean`` is the mean deviation, which is common to all heliostats, and ``rot_rms`` is the
+    RMS deviation. The standard deviations are also averaged as root mean squares.
     """
     every = orientations.found
     row: dict[str, Any] = {
@@ -154,20 +154,22 @@ def flight_row(orientations: Orientations, flight: str = "") -> dict[str, Any]:
 def systematic_parts(
     o: Orientation, budget: Budget, place: npt.ArrayLike | None = None
 ) -> dict[str, FloatArray]:
-    """Return the share of each cause in the systematic part of an orientation, rad, (2,) each.
+    """Return the contribution of each cause to an orientation's systematic error, rad, (2,).
 
     Parameters
     ----------
     o
-        Measured with this budget: the squares add up to the square of its systematic part.
+        Orientation measured with this budget. The squares of the contributions add up to the square
+        of its systematic part.
     budget
-        Its lengths are the causes.
+        Error budget, whose entries are the causes.
     place
         Covariance of the mirror's position relative to the drone, m², (3, 3), if a bundle
-        adjustment found it: one cause, "place", instead of position, kinematics and RTK.
+        adjustment estimated it. The single cause "place" then replaces position, kinematics and
+        RTK.
     """
     kept = o.reflections.take(~o.outlier)
-    # A turn about x moves the normal towards −y, one about y towards x.
+    # A rotation about x moves the normal towards −y, and a rotation about y towards x.
     axes = np.stack([-o.rotation[:, 1], o.rotation[:, 0]])
     nothing = {f.name: 0.0 for f in fields(Budget)}
     geometry, used = (o.point[~o.outlier], kept.camera, kept.led, axes), list(nothing)
@@ -182,7 +184,7 @@ def systematic_parts(
 
 
 def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Write records as ``.csv`` or ``.parquet``, by the suffix; completely or not at all."""
+    """Write records as ``.csv`` or ``.parquet``, as the suffix says, completely or not at all."""
     import pandas as pd
 
     table = pd.DataFrame(rows)
@@ -205,7 +207,7 @@ def _pair(name: str, values: FloatArray) -> dict[str, float]:
 
 
 def _over(values: Sequence[FloatArray], mean: bool = False) -> FloatArray:
-    """Return the mean or root mean square of the finite pairs, (2,); NaN without any."""
+    """Return the mean or root mean square of the finite pairs, (2,); NaN if there are none."""
     table = as_float(values).reshape(-1, 2)
     table = table[np.isfinite(table).all(axis=-1)]
     if not len(table):

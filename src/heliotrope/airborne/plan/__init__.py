@@ -1,7 +1,7 @@
-"""Plans drone campaigns: clusters, poses, hover patterns, sorties and waypoint files.
+"""Plan drone campaigns: clusters, poses, hover patterns, sorties and waypoint files.
 
-Begin with `plan_flight`, which takes a plant and `PlanSettings`, and write its plan with
-`write_plan`. `heliotrope.airborne.plan.waypoints` writes waypoint files, and
+Begin with `plan_flight`, which takes a plant and `PlanSettings`; `write_plan` writes the resulting
+plan to files. `heliotrope.airborne.plan.waypoints` writes waypoint files, and
 `heliotrope.airborne.plan.flight_map` draws a map.
 """
 

@@ -23,13 +23,14 @@ Mask = npt.NDArray[np.bool_]
 
 #: Segments of a quarter circle in a route around a corner.
 _QUARTER = 3
-#: Detours run this far outside a keep-out, and this far inside the fence, m.
+#: Detours run this far outside a keep-out volume, and this far inside the fence, m.
 _OUTSIDE, _INSIDE = 0.5, 1.0
 #: Detours are tried at multiples of this height, m.
 _LEVEL = 5.0
-#: A detour is accepted at once if it is longer than the unobstructed way by less than this factor.
+#: A detour is accepted at once if it is longer than the unobstructed route by less than this
+#: factor.
 _SHORT = 1.1
-#: Points of a leg at which the height above ground is checked.
+#: Number of points of a leg at which the height above ground is checked.
 _CHECKS = 9
 #: A leg closer to the fence than this counts as touching it, m.
 _TOUCH = 1e-3
@@ -80,7 +81,7 @@ class KeepOut:
 
     @cached_property
     def shape(self) -> Geometry:
-        """The point or filled polygon on the ground that `radius` is measured from."""
+        """The point or filled polygon on the ground from which `radius` is measured."""
         shape = Point(self.corners[0]) if len(self.corners) == 1 else Polygon(self.corners)
         shapely.prepare(shape)
         return shape
@@ -99,14 +100,14 @@ class KeepOut:
         )
 
     def free(self, a: FloatArray, b: FloatArray) -> Mask:
-        """Return the mask of straight legs from ``a`` to ``b``, (M, 3), that stay outside, (M,)."""
+        """Return a mask, (M,), of the legs from ``a`` to ``b``, (M, 3), that stay outside."""
         free = np.ones(len(a), dtype=np.bool_)
         low, high = np.minimum(a, b), np.maximum(a, b)
         near = np.flatnonzero(~((high < self._box[0]) | (low > self._box[1])).any(axis=1))
         if not len(near):
             return free
         a, b = a[near], b[near]
-        # The part of each leg between bottom and top, as shares of its length.
+        # The part of each leg between bottom and top, as fractions of its length.
         rise = b[:, 2] - a[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             ends = np.stack([(self.bottom - a[:, 2]) / rise, (self.top - a[:, 2]) / rise])
@@ -121,7 +122,7 @@ class KeepOut:
 
 
 def tower(plant: Plant, clearance: float = 10.0) -> tuple[KeepOut, ...]:
-    """Return a keep-out cylinder for each receiver and target, from the ground to above it."""
+    """Return a keep-out cylinder from the ground up for each receiver and target."""
     volumes = []
     surfaces: list[Receiver | Target] = [*plant.receivers, *plant.targets]
     for surface in surfaces:
@@ -151,10 +152,10 @@ class Airspace:
         Minimum and maximum height above ground while measuring and in transit, m. Aviation law
         limits the maximum, to 120 m in the European Union's open category.
     margin
-        Margin to all keep-outs, m.
+        Margin around all keep-out volumes, m.
     ground
-        Points of known ground height, ENU metres, (N, 3); the nearest point counts. Without points
-        the ground is level at 0.
+        Points of known ground height, ENU metres, (N, 3); the nearest point determines the height.
+        Without points the ground is assumed to be level at 0.
     """
 
     keep_outs: tuple[KeepOut, ...] = ()
@@ -212,7 +213,7 @@ class Airspace:
         return as_float(self.ground[self._tree.query(points[:, :2])[1], 2])
 
     def free(self, points: npt.ArrayLike) -> Mask:
-        """Return the mask of points (M, 3) where a drone may be, (M,)."""
+        """Return a mask, (M,), of the points (M, 3) where a drone may be."""
         p = as_float(points).reshape(-1, 3)
         height = p[:, 2] - self.ground_below(p)
         # Rounding must not refuse a point at the limit.
@@ -223,7 +224,7 @@ class Airspace:
         return np.asarray(free)
 
     def free_legs(self, a: npt.ArrayLike, b: npt.ArrayLike) -> Mask:
-        """Return the mask of free straight legs from ``a`` to ``b``, (M, 3) each, (M,).
+        """Return a mask, (M,), of the free straight legs from ``a`` (M, 3) to ``b`` (M, 3).
 
         Vertical climbs and descents may start or end below the lower height limit.
         """
@@ -253,8 +254,9 @@ class Airspace:
     def route(self, a: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray | None:
         """Return the intermediate points on a short free route from ``a`` to ``b``, (M, 3).
 
-        None if there is no route. The route is straight if that is free. Otherwise it runs around
-        the corners of keep-outs at a constant height: that of the higher end, or above a keep-out.
+        The result is None if there is no route. The route is straight if the straight leg is free.
+        Otherwise it runs around the corners of keep-out volumes at a constant height, which is that
+        of the higher end or a height above a keep-out volume.
         """
         start, stop = as_float(a), as_float(b)
         if self.free_legs(start[None], stop[None])[0]:
@@ -309,7 +311,7 @@ class Airspace:
         return as_float(route[keep].reshape(-1, 3))
 
     def _graph(self, level: float) -> tuple[FloatArray, FloatArray]:
-        """Return detour corners at a height (M, 3) and lengths of free legs (M, M), 0 if none."""
+        """Return detour corners at a height, (M, 3), and lengths of free legs, (M, M), else 0."""
         if level not in self._graphs:
             corners = self._corners
             nodes = np.column_stack([corners, np.full(len(corners), level)])
@@ -328,7 +330,7 @@ class Airspace:
 
     @cached_property
     def _corners(self) -> FloatArray:
-        """Corners that detours turn at, (C, 2)."""
+        """Return the corners at which detours turn, (C, 2)."""
         # The chords of the arc around a corner must clear the radius.
         wide = 1.0 / np.cos(0.25 * np.pi / _QUARTER)
         rings = [
@@ -345,7 +347,7 @@ def path_length(points: FloatArray) -> float:
 
 
 def _polygon(corners: FloatArray, what: str) -> None:
-    """Raise an error for a polygon that encloses no area or whose edges cross."""
+    """Raise an error if a polygon encloses no area or its edges cross."""
     polygon = Polygon(corners)
     if not polygon.is_valid or polygon.area <= 0.0:
         raise InputError(
@@ -355,7 +357,7 @@ def _polygon(corners: FloatArray, what: str) -> None:
 
 
 def _legs(a: FloatArray, b: FloatArray) -> npt.NDArray[np.object_]:
-    """Return lines on the ground from ``a`` to ``b``, (M, 2); points where both are the same."""
+    """Return lines on the ground from ``a`` to ``b``, (M, 2); a point where the two coincide."""
     lines = np.atleast_1d(shapely.linestrings(np.stack([a, b], axis=1)))
     same = (a == b).all(axis=1)
     lines[same] = shapely.points(a[same])

@@ -33,7 +33,7 @@ from heliotrope.mechanism.drives import Drive
 
 #: Approximate angle between candidates, rad.
 _STEP = float(np.radians(12.0))
-#: Mirrors of a cluster on which candidates are tried.
+#: Number of mirrors of a cluster on which candidates are tried.
 _SOME = 24
 
 
@@ -44,11 +44,12 @@ class PointSelection:
     Attributes
     ----------
     points
-        Per heliostat; more than the unknowns of the model.
+        Number of points per heliostat, which must exceed the number of unknowns of the model.
     criterion
-        "d": most information; "v": smallest beam error over the year.
+        "d" for the most information, or "v" for the smallest beam error over the year.
     sigma
-        Standard deviation of a measured normal common to all its reflections, per direction, rad.
+        Standard deviation of a measured normal that is common to all its reflections, per
+        direction, rad.
     scatter
         Standard deviation of the normal measured by one reflection, rad, which is due to the slope
         deviations.
@@ -60,7 +61,7 @@ class PointSelection:
     share
         Minimum fraction of a cluster's heliostats that must be able to face the drone.
     priors
-        Standard deviations to use instead of the parameter table's, by name.
+        Standard deviations, by name, that replace those of the parameter table.
     """
 
     points: int = 20
@@ -112,7 +113,7 @@ class CalibrationPoints:
     facing
         Poses, batch shape (K, n).
     plan
-        The selection made for the central heliostat, with the expected errors.
+        The sightings selected for the central heliostat, with the expected errors.
     prospect
         What the photographs will show, (K, n).
     """
@@ -157,24 +158,24 @@ def calibration_points(
     Parameters
     ----------
     mirrors, rows
-        Mirrors of the plant, and the rows of the cluster, (n,).
+        Mirrors of the plant, and the indices of those in the cluster, (n,).
     middle
         Mechanism for which the points are chosen, batch shape (1,).
     aim
-        Its aim point in operation, (3,).
+        Aim point of that mechanism in operation, (3,).
     names
-        P parameters of its model.
+        P parameters of the model.
     suns
-        Directions to the sun over the year, (K, 3), see `information.suns_of_year`.
+        Directions to the sun over the year, (K, 3); see `information.suns_of_year`.
     airspace, sampling, selection
         Limits and settings.
     label
-        The cluster's name, for errors.
+        Name of the cluster, for error messages.
 
     Raises
     ------
     InputError
-        If fewer directions are possible than points requested.
+        If fewer directions are possible than points are requested.
     """
     armature, drives = Armature(mirrors.armature.table[rows]), Drive(mirrors.drives.table[rows])
     centre = armature.origin_1.mean(axis=0)
@@ -187,7 +188,7 @@ def calibration_points(
             "lower the distance or the elevations, or raise the upper height limit"
         )
     towards, points = towards[free], points[free]
-    # Neighbours can face almost the same directions: some of the mirrors represent all.
+    # Neighbours can face almost the same directions, so some of the mirrors represent all of them.
     some = np.unique(np.linspace(0, len(rows) - 1, _SOME).astype(np.intp))
     facing = face(Armature(armature.table[some]), Drive(drives.table[some]), points[:, None])
     able = facing.able.mean(axis=1) >= selection.share
@@ -220,7 +221,7 @@ def calibration_points(
         candidates, selection.points, information, form, criterion=selection.criterion
     )
     index = chosen.chosen.time.astype(np.intp)
-    # A short tour of the directions is short for mirrors and drone.
+    # A short tour of the directions means short slews for the mirrors and short legs for the drone.
     south = np.array([0.0, -1.0, 0.0])
     index = index[tour(possible[index], south)]
     # Start from the previous pose, so that mirrors stay on their branch.
@@ -251,7 +252,7 @@ def _free(
     middle = corners.mean(axis=2, keepdims=True)
     slope = mirrors.slopes[rows][:, :, None] - (corners - middle) / (2.0 * sampling.focal)
     wide = float(np.nanmax(np.linalg.norm(corners + distance * slope, axis=-1)))
-    # Patterns are a little larger where axes are oblique to their plane.
+    # Patterns are slightly larger where the optical axes are oblique to the plane of the pattern.
     half = 1.2 * (wide + distance * sampling.pointing) + sampling.least_spacing
     plane = half * tangent_axes(towards)
     free = airspace.free(points)
@@ -271,7 +272,7 @@ def _candidates(
     facing = face(middle.armature, middle.drives, points[:, None])
     rows = np.flatnonzero(facing.able[:, 0])
     counts = facing.counts[rows, 0]
-    # A normal that is off by σ turns the ray by 2 σ.
+    # A normal that is off by σ rotates the ray by 2 σ.
     zero = np.zeros(len(rows), dtype=np.intp)
     if len(rows):
         observed = drone(zero, counts, points[rows], points[rows], sigma=2.0 * sigma[rows])

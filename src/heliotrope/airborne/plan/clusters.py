@@ -1,8 +1,8 @@
 """Clusters: heliostats that are measured from one hover pattern.
 
-Clusters have equal ground areas and are as compact as that allows, as HelioPoint requires: they are
-the cells of a power diagram (Aurenhammer, Hoffmann & Aronov 1998: among all partitions into given
-areas, its cells have the smallest sum of squared distances from their centres).
+Clusters have equal ground areas and are as compact as that allows, as HelioPoint requires. They are
+the cells of a power diagram, which among all partitions into given areas have the smallest sum of
+squared distances from their centres (Aurenhammer, Hoffmann & Aronov 1998).
 """
 
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from scipy.spatial import cKDTree
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, as_vectors
 
-#: Areas are counted in squares, this many for the ground of a mean heliostat. (GEOS's Voronoi cells
-#: fail with a TopologyException on radial fields of 10,000 heliostats.)
+#: Areas are counted in squares; the ground of an average heliostat has this many. (GEOS's Voronoi
+#: cells fail with a TopologyException on radial fields of 10,000 heliostats.)
 _SQUARES = 16
 #: Ground farther than this from every heliostat, in typical spacings, is not part of the field.
 _EDGE = 0.8
-#: Rounds until the cells are round, and most rounds.
+#: Minimum number of iterations, after which the cells are round, and maximum number.
 _SETTLED, _ROUNDS = 60, 200
-#: Areas are equal if none differs from their mean by more than this share.
+#: Areas count as equal if none differs from the mean by more than this fraction.
 _EVEN = 0.02
 
 
@@ -32,7 +32,7 @@ class HeliostatClusters:
     Attributes
     ----------
     of
-        Cluster of each heliostat, 0 … K − 1, (N,).
+        Cluster index of each heliostat, 0 … K − 1, (N,).
     center
         Mean position, ENU metres, (K, 3).
     area
@@ -40,8 +40,8 @@ class HeliostatClusters:
     radius
         Largest horizontal distance of a heliostat from the centre, m, (K,).
     roundness
-        Mean squared distance from the centre for a disk of the same area, divided by that of the
-        heliostats, (K,): 1 for a disk, 0.95 for a square, 0.6 for a rectangle of 1:3.
+        Mean squared distance from the centre of a disc with the same area, divided by that of the
+        heliostats, (K,). It is 1 for a disc, 0.95 for a square and 0.6 for a 1:3 rectangle.
     """
 
     of: npt.NDArray[np.intp]
@@ -68,8 +68,8 @@ def ground_areas(position: npt.ArrayLike) -> FloatArray:
 
     Notes
     -----
-    The Voronoi cell, without ground that is farther than 0.8 typical spacings from
-    every heliostat; counted in squares, so accurate to a few per cent of a cell.
+    The area is that of the Voronoi cell, without ground that is farther than 0.8 typical spacings
+    from every heliostat. It is counted in squares, and accurate to a few per cent.
     """
     flat = _flat(position)
     if len(flat) == 1:
@@ -83,7 +83,7 @@ def ground_areas(position: npt.ArrayLike) -> FloatArray:
     low, high = flat.min(axis=0) - spacing, flat.max(axis=0) + spacing
     counts = np.ceil((high - low) / side).astype(np.int64)
     while counts.prod() > max(100_000, 4 * _SQUARES * len(flat)):
-        # Outlying heliostats far away need no finer squares.
+        # Distant outlying heliostats would make the grid too large, so the squares are enlarged.
         side *= 2.0
         counts = np.ceil((high - low) / side).astype(np.int64)
     east, north = (low[k] + side * (np.arange(counts[k]) + 0.5) for k in (0, 1))
@@ -91,7 +91,7 @@ def ground_areas(position: npt.ArrayLike) -> FloatArray:
     nearest = tree.query(squares, distance_upper_bound=_EDGE * spacing)
     distance, owner = (np.asarray(part) for part in nearest)
     cells = np.bincount(owner[np.isfinite(distance)], minlength=len(flat))
-    # Heliostats at one position share a cell, but none may have no weight.
+    # Heliostats at the same position share a cell, but each needs a weight above 0.
     return np.asarray(np.maximum(cells, 1) * side**2)
 
 
@@ -107,8 +107,8 @@ def clusters(
     size
         Diameter of a disc with the area of a cluster, m.
     max_radius
-        Largest distance of a heliostat from the centre of its cluster, m; clusters become
-        smaller than ``size`` where that requires it.
+        Largest distance of a heliostat from the centre of its cluster, m. If necessary, clusters
+        are made smaller than ``size`` to respect it.
 
     Raises
     ------
@@ -131,14 +131,14 @@ def clusters(
 
 
 def tour(center: npt.ArrayLike, start: npt.ArrayLike) -> npt.NDArray[np.intp]:
-    """Return a short order in which to visit places from ``start`` (nearest first, then 2-opt).
+    """Return a short tour of places from ``start`` (nearest first, then 2-opt).
 
     Parameters
     ----------
     center
-        (K, M) coordinates.
+        Coordinates of the places, (K, M).
     start
-        Start of the tour, (M,); it need not end there.
+        Start of the tour, (M,), which need not be its end.
     """
     points = np.asarray(center, dtype=np.float64)
     gap = np.linalg.norm(points[:, None] - points[None], axis=-1)
@@ -172,7 +172,7 @@ def _flat(position: npt.ArrayLike) -> FloatArray:
 
 
 def _partition(flat: FloatArray, area: FloatArray, count: int) -> npt.NDArray[np.intp]:
-    """Return the cell of each heliostat in a power diagram of ``count`` equal areas."""
+    """Return the cell of each heliostat in a power diagram with ``count`` equal areas."""
     if count == 1:
         return np.zeros(len(flat), dtype=np.intp)
     order = _along_curve(flat)
@@ -185,7 +185,8 @@ def _partition(flat: FloatArray, area: FloatArray, count: int) -> npt.NDArray[np
     for k in range(_ROUNDS):
         inside = np.bincount(of, weights=area, minlength=count)
         unequal = float(np.abs(inside / target - 1.0).max())
-        # The pieces of the curve are equal from the start, but long: let them become round.
+        # The pieces of the curve have equal areas from the start, but are long, so let them become
+        # round.
         if k >= _SETTLED and unequal < worst and inside.min() > 0.0:
             best, worst = of, unequal
             if worst < _EVEN:
@@ -195,19 +196,19 @@ def _partition(flat: FloatArray, area: FloatArray, count: int) -> npt.NDArray[np
             [np.bincount(of, weights=area * flat[:, d], minlength=count) / held for d in (0, 1)],
             axis=-1,
         )
-        # A cell without heliostats restarts beside the fullest one.
+        # A cell without heliostats restarts beside the fullest cell.
         center[inside <= 0.0] = center[int(np.argmax(inside))] + 1e-3
-        # A weight is a squared radius: it grows with the missing area.
+        # A weight is a squared radius, which grows with the missing area.
         weight += 0.5 * (target - inside) / np.pi
         weight -= weight.mean()
-        # Squared distance less weight, without the terms that all cells share.
+        # This is the squared distance minus the weight, without the terms that all cells share.
         power = (center**2).sum(axis=-1) - weight - 2.0 * flat @ center.T
         of = np.argmin(power, axis=1).astype(np.intp)
     return best
 
 
 def _along_curve(flat: FloatArray) -> npt.NDArray[np.intp]:
-    """Return the order along Hilbert's curve, which keeps neighbours together."""
+    """Return the order along the Hilbert curve, which keeps neighbours together."""
     low = flat.min(axis=0)
     extent = max(float((flat.max(axis=0) - low).max()), 1e-9)
     bits = 16
@@ -224,7 +225,7 @@ def _along_curve(flat: FloatArray) -> npt.NDArray[np.intp]:
 
 
 def _described(of: npt.NDArray[np.intp], place: FloatArray, area: FloatArray) -> HeliostatClusters:
-    # Number without gaps, in case a cell stayed empty.
+    # Number the cells without gaps, in case a cell stayed empty.
     of = np.unique(of, return_inverse=True)[1].astype(np.intp)
     number = np.bincount(of)
     center = np.stack([np.bincount(of, weights=place[:, d]) / number for d in range(3)], axis=-1)
@@ -233,6 +234,7 @@ def _described(of: npt.NDArray[np.intp], place: FloatArray, area: FloatArray) ->
     radius = np.zeros(len(number))
     np.maximum.at(radius, of, away)
     spread = np.bincount(of, weights=area * away**2) / whole
-    # Include the spread of each heliostat's own ground, so that a lone one has some.
+    # Include the spread of each heliostat's own ground, so that the spread of a lone heliostat is
+    # not 0.
     spread += np.bincount(of, weights=area**2) / whole / (2.0 * np.pi)
     return HeliostatClusters(of, center, whole, radius, whole / (2.0 * np.pi) / spread)

@@ -1,8 +1,8 @@
 """The dome flight in HelioPoint's appendix A: photographs of coded targets from a hemisphere.
 
-Photogrammetry needs rays that intersect at wide angles, from all sides and several heights; every
-photograph is aimed at the middle of the targets. The paper shows such a flight (figure 7) but
-states neither its radius nor the number of photographs; the values here are our own.
+Photogrammetry needs rays that intersect at wide angles, from all sides and several heights. Every
+photograph is therefore aimed at the middle of the targets. The paper shows such a flight (figure 7)
+but states neither its radius nor the number of photographs; the values here are our own.
 """
 
 from collections.abc import Sequence
@@ -37,11 +37,11 @@ class Dome:
     position
         Positions of the P photographs in flight order, ENU metres, (P, 3).
     rotation
-        Camera axes to ENU, (P, 3, 3).
+        Rotation from camera axes to ENU, (P, 3, 3).
     targets
-        Positions where the targets are to be placed; decimetres do not matter.
+        Positions where the targets are to be placed, to within some decimetres.
     side
-        Side of their black squares, m.
+        Side of the black squares of the targets, m.
     """
 
     center: FloatArray
@@ -71,11 +71,12 @@ def plan_dome(
     center
         Middle of the targets on the ground, ENU metres, (3,).
     radius
-        Distance of the photographs from it, m.
+        Distance of the photographs from ``center``, m.
     elevations
         Elevations of the rings of photographs, rad.
     photographs
-        Total number; each ring gets a number in proportion to its circumference, at least four.
+        Total number of photographs. Each ring receives a number in proportion to its circumference,
+        but at least four.
     targets, spacing, side
         Number of targets, laid out in a square; distance between neighbours, m; side of the black
         squares, m.
@@ -83,7 +84,7 @@ def plan_dome(
     Raises
     ------
     InputError
-        If a number is out of its range.
+        If an argument is out of range.
     """
     for name, value, low, high in (
         ("radius", radius, 2.0, 200.0),
@@ -104,7 +105,7 @@ def plan_dome(
     places: list[FloatArray] = []
     for ring, (up, part) in enumerate(zip(rings, share, strict=True)):
         count = max(4, round(photographs * part))
-        # Neighbouring rings are turned, and flown one way, then the other.
+        # Neighbouring rings are rotated against each other, and flown in opposite directions.
         turns = 2.0 * np.pi * (np.arange(count) + 0.5 * (ring % 2)) / count
         around = turns if ring % 2 == 0 else turns[::-1]
         places += [middle + radius * direction(a, float(up)) for a in around.tolist()]

@@ -1,8 +1,8 @@
-"""Flights: the order of the stations, take-off positions and duration.
+"""Plan flights: the order of the stations, take-off positions and duration.
 
 A station is one cluster in one pose, measured with one hover pattern. While a drone flies the
 stations of some clusters, the heliostats of the other clusters move to their next pose. Clusters
-are therefore flown in groups: the whole group in one pose, then in the next.
+are therefore flown in groups. The whole group is flown in one pose, then in the next pose.
 """
 
 from collections.abc import Sequence
@@ -73,7 +73,7 @@ class Craft:
         return 2.0 * float(np.sqrt(length / self.acceleration))
 
     def way(self, points: FloatArray) -> float:
-        """Return the duration of a route through points (M, 3) with a stop at each, s."""
+        """Return the duration of a route through points (M, 3) with a stop at each point, s."""
         return sum(self.time(float(d)) for d in np.linalg.norm(np.diff(points, axis=0), axis=-1))
 
 
@@ -88,7 +88,7 @@ class HoverStation:
     pattern
         The hover points.
     travel
-        Time that the heliostats need to move from the previous pose, s; 0 for the first.
+        Time that the heliostats need to move from the previous pose, s; 0 for the first pose.
     """
 
     cluster: int
@@ -114,15 +114,15 @@ class StationVisit:
     Attributes
     ----------
     station
-        Row of the station.
+        Index of the station.
     first, last
-        Rows of its hover points, ``last`` excluded.
+        Indices of the first hover point and of the point after the last.
     approach
         Points between the previous position and the first hover point, ENU metres, (M, 3).
     begin, end
-        First and last moment of photographing, s since the start of the campaign.
+        Start and end of photography, s since the start of the campaign.
     wait
-        Hover time before the first photograph, while heliostats are still moving, s.
+        Hover time before the first photograph while heliostats are still moving, s.
     """
 
     station: int
@@ -180,7 +180,7 @@ class _Routes:
     def between(
         self, a: FloatArray, b: FloatArray, whence: int, whither: int, home: FloatArray, drone: int
     ) -> FloatArray:
-        """Return the route between positions of two stations; row -1 is the home."""
+        """Return the route between positions of two stations; index -1 means the home position."""
         legs = self.airspace.free_legs
         if legs(a[None], b[None])[0]:
             return np.empty((0, 3))
@@ -188,7 +188,7 @@ class _Routes:
         if key not in self.known:
             ends = [home if r < 0 else self.stations[r].pattern.center for r in (whence, whither)]
             self.known[key] = self._searched(ends[0], ends[1], max(whence, whither))
-        # The route between the centres is good enough if it can be joined and left from these
+        # The route between the station centres is good enough if it can be joined and left at these
         # points.
         route = self.known[key]
         if len(route) and legs(np.stack([a, route[-1]]), np.stack([route[0], b])).all():
@@ -220,7 +220,8 @@ def fly(
     Parameters
     ----------
     stations
-        Stations of all clusters; those of one cluster in the order of its points.
+        Stations of all clusters. The stations of a cluster are in the order of its calibration
+        points.
     order
         Clusters in the order of a short tour.
     airspace, craft
@@ -228,12 +229,12 @@ def fly(
     home
         Take-off positions, ENU metres, (count, 3).
     labels
-        Names of the clusters, for errors.
+        Names of the clusters, for error messages.
 
     Notes
     -----
-    Each drone gets a connected part of the tour with an equal share of the
-    photographs, and the size of groups, of 1 to 8 clusters, that brings it home first.
+    Each drone receives a connected part of the tour with an equal share of the photographs. Its
+    group size, 1 to 8 clusters, is the one with which the drone finishes earliest.
 
     Raises
     ------
@@ -256,7 +257,8 @@ def fly(
             rows = grouped(mine, place, size)
             tried = _sorties_of(drone, rows, stations, home[drone], craft, routes)
             if best and tried[-1].end > 0.995 * best[-1].end:
-                # Moving heliostats no longer cause a wait; larger groups only lengthen the flight.
+                # Moving heliostats no longer cause a wait, so larger groups would only lengthen the
+                # flight.
                 break
             best, rest = tried, rows
         if flown:
@@ -267,7 +269,7 @@ def fly(
 
 
 def grouped(clusters: Sequence[int], place: dict[int, list[int]], size: int) -> list[int]:
-    """Return rows of stations: all clusters of a group in one pose before the next pose."""
+    """Return station indices: all clusters of a group in one pose before the next pose."""
     rows: list[int] = []
     groups = max(1, len(clusters) // size)
     for group in np.array_split(np.array(clusters), groups):
@@ -288,7 +290,7 @@ def _sorties_of(
     routes: _Routes,
     others: "Sequence[Timeline]" = (),
 ) -> list[Sortie]:
-    """Return the sorties of one drone that flies ``rows`` in order and avoids others."""
+    """Return the sorties of a drone that flies ``rows`` in order and avoids other drones."""
     work = _Work(drone, stations, home, craft, routes, others, {}, [], [])
     for row in rows:
         work.station(row)
@@ -316,7 +318,7 @@ class _Work:
     row: int = -1
 
     def station(self, row: int) -> None:
-        """Fly one station, with landings in between where the battery requires them."""
+        """Fly one station, landing in between whenever the battery requires it."""
         station = self.stations[row]
         camera = station.pattern.camera
         step = self.craft.photo + self.craft.time(station.pattern.spacing)
@@ -396,7 +398,7 @@ class Timeline:
     Attributes
     ----------
     time
-        s since the start of the campaign, rising, (W,).
+        Time since the start of the campaign, s, ascending, (W,).
     place
         ENU metres, (W, 3).
     """
@@ -479,7 +481,7 @@ def separation(sorties: Sequence[Sortie], stations: Sequence[HoverStation], craf
 
 @dataclass(frozen=True)
 class CameraTarget:
-    """Duration of the same measurements if made by a camera at a target.
+    """Duration of the same measurements if they are made with a camera and a target.
 
     Attributes
     ----------
@@ -533,7 +535,7 @@ def camera_target(
         if not (np.isfinite(value) and value > 0.0):
             raise InputError(f"{name} must be above 0, not {value:g}")
     begin = np.datetime64(f"{year}-01-01").astype("datetime64[s]").astype(np.float64)
-    # Every 29 minutes of a year, which samples all hours of the day equally.
+    # One sample every 29 minutes of a year covers all hours of the day equally.
     moments = begin + np.arange(0.0, 365.0 * 86400.0, 29.0 * 60.0)
     up = position(moments, site).elevation >= min_elevation
     sunny = 24.0 * float(up.mean()) * min(clear, 1.0)
@@ -546,7 +548,7 @@ def camera_target(
 
 
 def mirror_travel(counts: FloatArray, speed: npt.ArrayLike) -> FloatArray:
-    """Return how long the heliostats move from pose to pose, s, (K,); the first is 0.
+    """Return how long the heliostats take to move to each pose, s, (K,); 0 for the first.
 
     Parameters
     ----------
@@ -560,6 +562,6 @@ def mirror_travel(counts: FloatArray, speed: npt.ArrayLike) -> FloatArray:
 
 
 def homes(home: FloatArray, count: int, apart: float = 20.0) -> FloatArray:
-    """Return a take-off position for each drone, in a row from west to east, (count, 3)."""
+    """Return the take-off positions of the drones, in a row from west to east, (count, 3)."""
     shift = apart * (np.arange(count) - 0.5 * (count - 1))
     return np.asarray(home + shift[:, None] * np.array([1.0, 0.0, 0.0]))

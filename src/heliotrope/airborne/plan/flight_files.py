@@ -1,4 +1,4 @@
-"""The files of a flight plan: waypoints of each sortie, heliostat commands, and JSON."""
+"""Write the files of a flight plan: waypoints of each sortie, heliostat commands, and JSON."""
 
 import csv
 import io
@@ -27,7 +27,7 @@ Progress = Callable[[int, int], None]
 
 
 def sortie_name(sortie: Sortie) -> str:
-    """Return the name of a sortie's files: drone and number."""
+    """Return the name of a sortie's files, which consists of drone and number."""
     return f"drone{sortie.drone + 1}-{sortie.number + 1:03d}"
 
 
@@ -81,7 +81,7 @@ def _origin(site: Site) -> tuple[float, float, float]:
 
 
 def _return_height(airspace: Airspace, sortie: Sortie) -> float:
-    """Return a height above all keep-outs, or the greatest one allowed, m above take-off."""
+    """Return a height above all keep-outs, or the maximum allowed, m above take-off."""
     tops = [k.top + airspace.margin for k in airspace.keep_outs if np.isfinite(k.top)]
     return float(min(airspace.max_height, max([airspace.min_height, *tops]) - sortie.home[2]))
 
@@ -125,7 +125,7 @@ def write_plan(
     formats
         Names from `FORMATS`.
     aircraft
-        Aircraft for DJI's files, see `AIRCRAFT`.
+        Aircraft for DJI's files; see `AIRCRAFT`.
     progress
         Called with the numbers of sorties (done, total).
 
@@ -223,7 +223,7 @@ def commands(plan: FlightPlan) -> str:
 
 
 def document(plan: FlightPlan) -> dict[str, Any]:
-    """Return the plan as stored in plan.json; names include the units."""
+    """Return the plan as stored in plan.json, with units in the names."""
     settings, air = plan.settings, plan.settings.airspace
     timing = {v.station: [np.inf, 0.0] for s in plan.sorties for v in s.visits}
     for sortie in plan.sorties:
@@ -338,12 +338,13 @@ def read_airspace(path: str | Path, base: Airspace) -> tuple[Airspace, FloatArra
     Parameters
     ----------
     path
-        An object that may have ``min_height_m``, ``max_height_m``, ``margin_m``, ``home`` ([east,
-        north, up]), ``fence`` ([[east, north], …]) and ``keep_out``: a list of objects with
-        ``name`` and either ``polygon`` ([[east, north], …]) or ``centre`` ([east, north]) and
-        ``radius_m``, and optionally ``bottom_m`` and ``top_m``.
+        JSON file with an object that may have ``min_height_m``, ``max_height_m``, ``margin_m``,
+        ``home`` ([east, north, up]), ``fence`` ([[east, north], …]) and ``keep_out``: a list of
+        objects with ``name`` and either ``polygon`` ([[east, north], …]) or ``centre`` ([east,
+        north]) and ``radius_m``, and optionally ``bottom_m`` and ``top_m``.
     base
-        Airspace whose keep-outs are kept, and whose limits apply if the file does not set them.
+        Airspace whose keep-out volumes are kept, and whose limits apply if the file does not set
+        them.
 
     Raises
     ------

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Okabe and Ito's colours, distinct for the colour-blind too.
+#: Okabe and Ito's colours, which colour-blind readers can distinguish.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 #: Muted colours that distinguish neighbouring clusters.
 _SHADES = ("#7f9cc4", "#c49a6c", "#8fae7a", "#b58aa5", "#6fa3a3", "#a3a3a3", "#c2b04f")
@@ -23,9 +23,10 @@ def flight_map(plan: FlightPlan) -> "Figure":
 
     Notes
     -----
-    Left: heliostats in the colour of their cluster, its name, a dot for each station,
-    the routes of each drone's first sorties, homes, keep-outs and fence. Right: directions to the
-    drone of all stations, azimuth around and elevation inwards.
+    The left part shows the heliostats in the colour of their cluster, the cluster names, a dot for
+    each station, the routes of each drone's first sorties, the home positions, keep-out volumes and
+    the fence. The right part shows the directions to the drone from all stations, with azimuth
+    around the circle and elevation inwards.
     """
     from matplotlib.figure import Figure
 
@@ -63,7 +64,7 @@ def _field(ax: "Axes", plan: FlightPlan) -> None:
 
 
 def _routes(ax: "Axes", plan: FlightPlan) -> None:
-    """Draw the first sorties of each drone; all of them would hide the field."""
+    """Draw the first sorties of each drone; drawing all sorties would hide the field."""
     for drone, home in enumerate(plan.homes):
         colour = _COLOURS[drone % len(_COLOURS)]
         some = [s for s in plan.sorties if s.drone == drone][:2]
@@ -115,7 +116,7 @@ def _directions(ax: "Axes", plan: FlightPlan) -> None:
     )
     assert ax.figure is not None
     ax.figure.colorbar(dots, ax=ax, label="clusters seen from there, %", shrink=0.7)
-    # Clockwise from north, as azimuth is.
+    # The angle runs clockwise from north, as azimuth does.
     ax.set_theta_zero_location("N")  # type: ignore[attr-defined] # of polar axes only
     ax.set_theta_direction(-1)  # type: ignore[attr-defined] # of polar axes only
     ax.set_ylim(0.0, 90.0)

@@ -1,4 +1,4 @@
-"""The plan of a campaign: clusters, poses, hover patterns, flights and their duration."""
+"""Plan a campaign: clusters, poses, hover patterns, flights and their duration."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -44,10 +44,10 @@ class PlanSettings:
         Largest angle between an optical axis and the mean axis of its cluster, rad; it limits the
         cluster radius to distance · tan(spread).
     view
-        Angle of view of the camera across its shorter side, rad, so that a cluster fits into a
+        Angle of view of the camera across its shorter side, rad. A cluster must fit into a
         photograph.
     model
-        Error model whose unknowns are to be estimated; "auto" selects jacks or malan8.
+        Error model whose unknowns are to be estimated; "auto" selects the model jacks or malan8.
     sampling, selection, craft, airspace
         Patterns, calibration points, drones, and where drones may fly.
     home
@@ -98,7 +98,7 @@ class FlightPlan:
     clusters
         The K clusters.
     labels
-        Their names, (K,).
+        Names of the clusters, (K,).
     points
         Calibration points of each cluster, (K,).
     stations
@@ -142,7 +142,7 @@ class FlightPlan:
 
     @property
     def poses(self) -> int:
-        """Orientations to measure: heliostats times their reachable calibration points."""
+        """Number of orientations to measure: the reachable calibration points of all heliostats."""
         return sum(int(k.facing.able.sum()) for k in self.points)
 
     def summary(self) -> dict[str, Any]:
@@ -196,7 +196,7 @@ def plan_flight(
     Parameters
     ----------
     plant
-        The plant, with its calibrated mechanisms, if any.
+        The plant; calibrated mechanisms are used if it has any.
     settings
         Settings; if the airspace has no ground points, those of the plant are used.
     progress

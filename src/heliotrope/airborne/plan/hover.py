@@ -7,14 +7,14 @@ plane perpendicular to the axis at distance D in
 
 $$ q(x) = x + D \, s(x) + D \, e $$
 
-for a mirror with a pointing error e. The drone sees all of the mirror if the pattern covers the
+for a mirror with a pointing error e. The drone sees the whole mirror if the pattern covers the
 range of x + D s(x), widened by D e on all sides. Within a facet of focal length f, s = -x / 2f, so
 a step g of the drone moves the reflection by
 
 $$ g / |1 - D / 2f| $$
 
-and n samples on a facet of w by h require $g = \sqrt{w h / n} \, |1 - D / 2f|$. A pointing
-error thus moves the reflection on a flat facet by D e: 0.75 m at 150 m and 5 mrad.
+and n samples on a facet of size w by h require $g = \sqrt{w h / n} \, |1 - D / 2f|$. A pointing
+error thus moves the reflection on a flat facet by D e, which is 0.75 m at 150 m and 5 mrad.
 """
 
 from dataclasses import dataclass
@@ -29,9 +29,11 @@ from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import track
 
-#: Rounds of the fixed-point iteration on the vertex; each gains a factor of distance over offset.
+#: Number of rounds of the fixed-point iteration on the vertex; each reduces the error by the factor
+#: offset over distance.
 _ROUNDS = 4
-#: Where a step of the drone moves a reflection by 20 steps or more, its position is undefined.
+#: If a step of the drone moves a reflection by 20 steps or more, the position of the reflection is
+#: undefined.
 _BLURRED = 0.05
 
 
@@ -44,7 +46,7 @@ class Sampling:
     distance
         Distance from the middle of a cluster to its hover plane, m.
     pointing
-        Pointing error that the pattern covers, rad: for newly installed heliostats a few times
+        Pointing error that the pattern covers, rad. For newly installed heliostats use a few times
         their standard deviation, later less.
     samples
         Number of samples on each facet.
@@ -85,19 +87,19 @@ class Sampling:
 
 @dataclass(frozen=True)
 class HoverMirrors:
-    """Properties of all N heliostats of a plant that hover patterns depend on.
+    """Properties of a plant's N heliostats on which hover patterns depend.
 
     Attributes
     ----------
     names
         Names of the heliostats.
     armature, drives
-        Calibrated, batch shapes (N,) and (N, 2).
+        Calibrated armatures and drives, batch shapes (N,) and (N, 2).
     corners
-        Facets' corners in the mirror's plane (x to the right as seen from the front, y up), m,
-        (N, F, 4, 2); NaN for facets that a heliostat lacks.
+        Corners of the facets in the mirror's plane (x to the right as seen from the front, y up),
+        m, (N, F, 4, 2); NaN for facets that a heliostat lacks.
     slopes
-        Slopes of the facets' normals against the mirror's, rad, (N, F, 2).
+        Slopes of the facet normals relative to the mirror normal, rad, (N, F, 2).
     facet_area
         Area of the smallest facet, m², (N,).
     """
@@ -170,7 +172,7 @@ class Facing:
     Attributes
     ----------
     counts
-        Counts of the drives, (..., 2).
+        Drive counts, (..., 2).
     normal, vertex
         ENU, (..., 3).
     able
@@ -195,14 +197,14 @@ def face(
     point
         ENU metres, (..., 1, 3) or (..., N, 3).
     current
-        Present counts of the drives, to choose the nearer branch.
+        Present drive counts, used to choose the nearer branch.
 
     Notes
     -----
     Lamp and camera are treated as one point, so the normal must satisfy n ∥ p − m. The vertex m
     moves with the pose. The direction to p is taken from the previous vertex, and its error shrinks
-    by (offset / distance) in each of four rounds: at 100 m and an offset of 0.5 m, to less than a
-    nanometre.
+    by the factor offset / distance in each of four rounds. At 100 m and an offset of 0.5 m, the
+    final error is less than a nanometre.
     """
     goal = as_float(point)
     start = armature.origin_1
@@ -226,11 +228,11 @@ class Pattern:
     Attributes
     ----------
     center
-        Its middle, ENU metres, (3,).
+        Middle of the pattern, ENU metres, (3,).
     direction
         Unit vector from the field to the drone, normal to the plane, (3,).
     columns, rows
-        Points across and upwards.
+        Numbers of points across and upwards.
     spacing
         Spacing between neighbours, m.
     samples
@@ -260,7 +262,7 @@ def reach(
     direction: FloatArray,
     sampling: Sampling,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the lower and upper bound of the drone positions that mirrors require.
+    """Return the lower and upper bounds of the drone positions that mirrors require.
 
     Parameters
     ----------
@@ -284,7 +286,7 @@ def reach(
     axes = tangent_axes(normal)
     right, up = -axes[:, 0, None, None], axes[:, 1, None, None]
     middle = corners.mean(axis=2, keepdims=True)
-    # Within a curved facet the slope decreases with the distance from its middle.
+    # Within a curved facet the slope decreases with the distance from the middle of the facet.
     slope = slopes[:, :, None] - (corners - middle) / (2.0 * sampling.focal)
     place = vertex[:, None, None] + corners[..., :1] * right + corners[..., 1:] * up
     ray = normal[:, None, None] + slope[..., :1] * right + slope[..., 1:] * up
@@ -303,7 +305,7 @@ def spacing(facet_area: FloatArray, slant: FloatArray, sampling: Sampling) -> tu
     Parameters
     ----------
     facet_area, slant
-        Smallest facet, m², and distance to the drone, m, of n mirrors, (n,).
+        Area of the smallest facet, m², and distance to the drone, m, of n mirrors, (n,).
     sampling
         Requested sampling.
 
@@ -319,7 +321,7 @@ def spacing(facet_area: FloatArray, slant: FloatArray, sampling: Sampling) -> tu
             f"{float(slant[scale.argmin()]):.0f} m: close to twice the focal length the whole "
             "facet lights up; change the distance"
         )
-    # Drone spacing that gives the number of samples asked for.
+    # Drone spacing that yields the requested number of samples.
     required = float((np.sqrt(facet_area / sampling.samples) * scale).min())
     step = max(required, sampling.least_spacing)
     return step, sampling.samples * (required / step) ** 2

@@ -1,6 +1,6 @@
-"""What photographs from a direction will show: visible mirrors, their size, and reflections.
+"""Predict what photographs from a direction will show: visible mirrors, sizes, reflections.
 
-The visibility model is that of the evaluation (`heliotrope.airborne.visibility`).
+The visibility model is the one used in the evaluation (`heliotrope.airborne.visibility`).
 """
 
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ class Prospect:
     Attributes
     ----------
     reflections
-        Expected number on the visible part of each mirror, (K, n).
+        Expected number of reflections on the visible part of each mirror, (K, n).
     side
-        Root of each mirror's area in a photograph, px, (K, n).
+        Square root of each mirror's area in a photograph, px, (K, n).
     """
 
     reflections: FloatArray
@@ -42,10 +42,10 @@ def prospect(
     points: FloatArray,
     sampling: Sampling,
 ) -> Prospect:
-    """Return the prospect of patterns around ``points`` (K, 3) for the mirrors ``rows``, (n,).
+    """Return the expected views of mirrors ``rows`` (n,) from patterns around ``points`` (K, 3).
 
-    ``facing`` are their poses, batch shape (K, n). Mirrors of other clusters are not considered:
-    they are in other poses, or moving.
+    ``facing`` are the poses of the mirrors, batch shape (K, n). Mirrors of other clusters are not
+    considered, because they are in other poses, or moving.
     """
     corners = mirrors.corners[rows]
     facets = np.isfinite(corners[:, :, 0, 0]).sum(axis=1)

@@ -21,10 +21,10 @@ class PlannedStation:
     name
         Cluster and calibration point, such as ``C1-3``, which is the name of the photograph folder.
     heliostats
-        Indices in the given list of names, (N,), without heliostats that cannot face the drone
-        there.
+        Indices of the heliostats in the list of names, (N,), without those that cannot face the
+        drone.
     counts
-        Counts of their drives, (N, D).
+        Drive counts of the heliostats, (N, D).
     pattern
         Positions of the photographs, in order, ENU metres, (P, 3).
     middle
@@ -39,7 +39,7 @@ class PlannedStation:
 
 
 def read_stations(path: str | Path, names: Sequence[str]) -> tuple[PlannedStation, ...]:
-    """Return the stations of a plan in the order of its file.
+    """Return the stations of a plan, in the order of the file.
 
     Parameters
     ----------
@@ -51,9 +51,9 @@ def read_stations(path: str | Path, names: Sequence[str]) -> tuple[PlannedStatio
     Raises
     ------
     FormatError
-        If the file is not such a plan.
+        If the file is not a flight plan.
     UnknownNameError
-        If it contains other heliostats.
+        If the plan contains a heliostat that is not in ``names``.
     """
     root = read_json(path, "a flight plan (plan.json)")
     version = root["format"].text()
@@ -79,7 +79,7 @@ def read_stations(path: str | Path, names: Sequence[str]) -> tuple[PlannedStatio
 
 
 def _patterns(root: JsonNode) -> dict[int, FloatArray]:
-    """Return the photographs' positions of each station; several sorties may share it."""
+    """Return the photograph positions of each station, which several sorties may share."""
     parts: dict[int, list[tuple[float, FloatArray]]] = {}
     for sortie in root["sorties"].elements():
         for visit in sortie["visits"].elements():

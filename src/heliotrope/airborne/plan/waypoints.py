@@ -1,9 +1,9 @@
 """Waypoint files: Litchi CSV, DJI WPML in KMZ, QGroundControl plan.
 
-Formats as published: Litchi Hub's CSV in metres; DJI's Waypoint Markup Language 1.0.2 (Cloud API
-documentation: template.kml and waylines.wpml in a folder ``wpmz``); QGroundControl's plan file
-(developer guide, mission items of MAVLink's common set). In all three, heights are relative to the
-take-off place.
+The formats are those published: Litchi Hub's CSV in metres; DJI's Waypoint Markup Language 1.0.2
+(Cloud API documentation: template.kml and waylines.wpml in a folder ``wpmz``); QGroundControl's
+plan file (developer guide, mission items of MAVLink's common set). In all three, heights are
+relative to the take-off place.
 """
 
 import csv
@@ -20,14 +20,15 @@ import shapely
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray
 
-#: WPML codes of drone, variant and payload, and the image types to store.
+#: WPML codes of the drone, its variant and the payload, and the image types to store.
 AIRCRAFT = {
     "M3E": (77, 0, 66, "visible"), "M3T": (77, 1, 67, "visible"), "M3M": (77, 2, 68, "visible"),
     "M30": (67, 0, 52, "wide"), "M30T": (67, 1, 53, "wide"),
     "M300-H20": (60, 0, 42, "wide"), "M300-H20T": (60, 0, 43, "wide"),
     "M350-H20": (89, 0, 42, "wide"), "M350-H20T": (89, 0, 43, "wide"),
 }  # fmt: skip
-#: Litchi: least distance between waypoints, m; longest stay, ms; actions at a waypoint.
+#: Limits of Litchi: minimum distance between waypoints, m; longest stay, ms; number of actions at a
+#: waypoint.
 _LITCHI_APART, _LITCHI_STAY, _LITCHI_ACTIONS = 0.6, 32_000, 15
 _WPMZ = "http://www.dji.com/wpmz/1.0.2"
 _KML = "http://www.opengis.net/kml/2.2"
@@ -55,7 +56,7 @@ class Mission:
     yaw_deg
         Heading, clockwise from north in [0, 360), (W,).
     pitch_deg
-        Pitch of the gimbal, −90 is straight down, (W,).
+        Pitch of the gimbal, where −90 is straight down, (W,).
     stay
         Hover time before a photograph, s, (W,); 0 if there is no photograph.
     photo
@@ -172,7 +173,7 @@ def litchi(mission: Mission) -> str:
 
 def _check_litchi(mission: Mission) -> None:
     lat, lon = np.radians(mission.latitude_deg), np.radians(mission.longitude_deg)
-    # A sphere is accurate enough for the distance of neighbours.
+    # A sphere is accurate enough for the distance between neighbours.
     step = 6.37e6 * np.hypot(np.diff(lat), np.cos(lat[:-1]) * np.diff(lon))
     gap = np.hypot(step, np.diff(mission.height))
     if len(gap) and gap.min() < 0.99 * _LITCHI_APART:
@@ -212,7 +213,7 @@ def wpml(mission: Mission, aircraft: str = "M3E") -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=3) as archive:
         for name, text in (("template.kml", template), ("waylines.wpml", waylines)):
-            # A fixed time, so that equal plans give equal files.
+            # The time is fixed, so that equal plans produce equal files.
             entry = zipfile.ZipInfo(f"wpmz/{name}", (2020, 1, 1, 0, 0, 0))
             entry.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(entry, text)
@@ -275,7 +276,7 @@ def _document(mission: Mission, aircraft: str, *, template: bool) -> str:
 
 
 def _heading(yaw_deg: float) -> str:
-    # WPML takes whole degrees from −180 to 180.
+    # WPML accepts whole degrees from −180 to 180.
     angle = round((yaw_deg + 180.0) % 360.0 - 180.0)
     return (
         "<wpml:waypointHeadingMode>smoothTransition</wpml:waypointHeadingMode>"
@@ -318,7 +319,7 @@ def _placemark(mission: Mission, k: int, template: bool) -> str:
 
 
 def _actions(mission: Mission, k: int) -> str:
-    """Return gimbal, hover and photograph actions; none where the drone only passes."""
+    """Return gimbal, hover and photograph actions; none at a waypoint that is only passed."""
     if not mission.photo[k]:
         return ""
     position = "<wpml:payloadPositionIndex>0</wpml:payloadPositionIndex>"
@@ -348,7 +349,7 @@ def _actions(mission: Mission, k: int) -> str:
         f"<wpml:actionActuatorFuncParam>{how}</wpml:actionActuatorFuncParam></wpml:action>"
         for i, (what, how) in enumerate(steps)
     )
-    # The waypoint's number identifies the group: it is unique in the file.
+    # The waypoint's number, which is unique in the file, identifies the group.
     return (
         f"<wpml:actionGroup><wpml:actionGroupId>{k}</wpml:actionGroupId>"
         f"<wpml:actionGroupStartIndex>{k}</wpml:actionGroupStartIndex>"
@@ -363,7 +364,7 @@ def _actions(mission: Mission, k: int) -> str:
 
 _TAKE_OFF, _WAYPOINT, _RETURN = 22, 16, 20
 _SPEED, _GIMBAL, _PHOTO = 178, 205, 2000
-#: MAVLink's frames: heights relative to home, and commands without a position.
+#: MAVLink frames: for heights relative to home, and for commands without a position.
 _RELATIVE, _NO_PLACE = 3, 2
 
 
@@ -443,7 +444,7 @@ def _fence(fence: Fence) -> dict[str, Any]:
     polygons = []
     for including, shapes in ((True, fence.inside), (False, fence.outside)):
         for shape in shapes:
-            # The format asks for corners in clockwise order, with east to the right.
+            # The format requires corners in clockwise order, with east to the right.
             anticlockwise = bool(shapely.is_ccw(shapely.linearrings(shape[:, ::-1])))
             corners = np.round(shape[::-1] if anticlockwise else shape, 9).tolist()
             polygons.append({"inclusion": including, "polygon": corners, "version": 1})

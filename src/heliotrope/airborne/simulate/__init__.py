@@ -1,9 +1,9 @@
 """Simulated flights with ground truth: exact reflections, rendered photographs, and trials.
 
 `fly` simulates a flight. `render_flight` writes its photographs, and `reflections_of` returns its
-reflections without images. `fly_rendered` also evaluates the photographs and compares the result
-with the ground truth. `trials` measures one mirror repeatedly, to find how many photographs a
-flight needs.
+reflections without rendering images. `fly_rendered` also evaluates the photographs and compares the
+result with the ground truth. `trials` measures one mirror repeatedly, to find how many photographs
+a flight needs.
 """
 
 from heliotrope.airborne.simulate.rendered import (

@@ -16,14 +16,14 @@ from heliotrope.airborne.simulate.simulation import Errors, miscalibrated
 from heliotrope.airborne.standing import MirrorPoses
 from heliotrope.geometry import rotation
 
-#: How targets lie: place, m, and tilt, rad (standard deviations).
+#: Standard deviations of target placement: position, m, and tilt, rad.
 _LAID, _TILT = 0.2, 0.02
 _START = datetime(2026, 6, 21, 10, 0, tzinfo=UTC)
 
 
 @dataclass(frozen=True)
 class DomeFlight:
-    """A simulated dome flight: photographs as taken and as recorded, and the true targets."""
+    """A simulated dome flight: true and recorded photographs, and the true targets."""
 
     camera: LedCamera
     known_camera: LedCamera

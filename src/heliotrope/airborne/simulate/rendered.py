@@ -1,7 +1,7 @@
-"""A rendered flight compared with its ground truth: photographs used, reflections, errors.
+"""Compare a rendered flight with its ground truth: photographs used, reflections, errors.
 
-`fly_rendered` writes the photographs of a flight and evaluates them like real photographs; only the
-files, the plant and the lens are passed from one step to the other.
+`fly_rendered` writes the photographs of a flight and evaluates them like real photographs. Only the
+files, the plant and the lens are passed from the first step to the second.
 """
 
 from dataclasses import dataclass
@@ -23,14 +23,14 @@ from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, as_float, direction
 from heliotrope.sun import Site
 
-#: A found reflection is the true one if it is this close on the same mirror, m.
+#: A found reflection matches a true reflection if it is this close to it on the same mirror, m.
 _SAME = 0.25
 #: Two reflections closer than this in the photograph are one spot, px.
 _MERGED = 5.0
-#: What is beside a reflection: another one, another mirror within the margin and the outline's own
-#: error, the ground within the margin; or nothing of these.
+#: What is beside a reflection: another reflection, another mirror (within the margin plus the error
+#: of the outline), the ground (within the margin), or none of these.
 KINDS = ("beside another reflection", "at another mirror", "at the mirror's edge", "clear")
-#: 90 % of a bivariate normal distribution lie within this many variances.
+#: 90 % of a bivariate normal distribution lie within this squared distance in standard deviations.
 _ELLIPSE = 4.605170185988091
 
 
@@ -43,14 +43,14 @@ class Compared:
     photographs, used
         Number of photographs rendered, and evaluated.
     shown, found, right
-        Number of true reflections on visible parts of mirrors; of those found; and of those found
-        on the right mirror.
+        Number of true reflections on visible parts of mirrors; number of these found; and number of
+        these found on the correct mirror.
     missed
-        Reflections shown but not found, by `KINDS`.
+        Number of reflections shown but not found, by kind of surroundings (`KINDS`).
     count
         Number of reflections on each of K measured mirrors, (K,).
     error, sigma
-        True error and σ_tot of each, rad, rotX and rotY, (K, 2).
+        True error and σ_tot of each mirror, rotX and rotY, rad, (K, 2).
     """
 
     photographs: int
@@ -65,7 +65,7 @@ class Compared:
 
     @property
     def identified(self) -> float:
-        """Fraction of the found reflections that are on the right mirror."""
+        """Fraction of the found reflections that are on the correct mirror."""
         return self.right / max(self.found, 1)
 
     @property
@@ -90,7 +90,7 @@ def fly_rendered(
     flight
         A simulated flight.
     plant
-        The field that contains its heliostats.
+        The field that contains the heliostats of the flight.
     folder
         Folder for the photographs.
     conditions, seed
@@ -113,7 +113,7 @@ def fly_rendered(
 def compare(
     flight: Flight, exact: Reflections, result: CampaignResult, fewest: int = 1
 ) -> Compared:
-    """Compare the only flight in a result with its ground truth."""
+    """Compare the single flight in a result with its ground truth."""
     evaluation = result.flights[0].evaluation
     names = {photo.name: k for k, photo in enumerate(flight.taken)}
     number = np.array([names[p.name] for p in evaluation.photos])
@@ -152,7 +152,7 @@ def compare(
 def visible_reflections(flight: Flight, exact: Reflections) -> dict[int, str]:
     """Return the reflections in the frame that no nearer mirror hides.
 
-    Each is labelled with its surroundings: the first of `KINDS` that applies.
+    Each reflection is labelled with its surroundings, the first of `KINDS` that applies.
     """
     stand, camera = flight.truth, flight.camera
     kinds: dict[int, str] = {}
@@ -192,8 +192,8 @@ def _kind(i: int, pixels: dict[int, FloatArray], labels: Labels) -> str:
 def paper_field(rows: int = 6, columns: int = 8) -> Heliostats:
     """Return mirrors like HelioPoint's: four facets, 3.2 m by 2.5 m in total.
 
-    They stand in staggered rows 6 m apart, 4.6 m from each other; the paper does not state the
-    distances.
+    The mirrors stand 4.6 m apart in staggered rows at intervals of 6 m; the paper does not state
+    the distances.
     """
     grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
     east = 4.6 * (grid[:, 0] + 0.5 * (grid[:, 1] % 2) - 0.5 * columns)
@@ -218,10 +218,10 @@ def paper_flight(
     seed: int = 0,
     mirrors: Heliostats | None = None,
 ) -> tuple[Flight, Plant]:
-    """Return a flight in HelioPoint's geometry, and its field.
+    """Return a flight in HelioPoint's geometry, and the field.
 
-    The mirrors face a drone 150 m away at 13.5° of elevation and 214° of azimuth, the means of the
-    paper's tables 4 and 5. The pattern covers a mirror and a pointing error of 5 mrad.
+    The mirrors face a drone 150 m away at 13.5° elevation and 214° azimuth, which are the means of
+    the paper's tables 4 and 5. The pattern covers a mirror and a pointing error of 5 mrad.
     """
     field = mirrors or paper_field()
     middle = field.position.mean(axis=0)

@@ -1,9 +1,9 @@
-"""Renders photographs of a simulated flight: ground, shadows, mirrors reflecting the sky, lamp.
+"""Render photographs of a simulated flight: ground, shadows, mirrors, sky and lamp.
 
-Light is measured in full scales of the sensor. The fraction of a pixel that a facet covers is
-exact, and the lamp's reflections are at the exact positions from `heliotrope.airborne.mirror`. Lens
-and motion blur are applied to the whole picture, followed by noise, clipping, the sRGB curve and
-JPEG.
+Light is measured in units of the sensor's full scale. The fraction of a pixel that a facet covers
+is exact, and the lamp's reflections are at the exact positions from `heliotrope.airborne.mirror`.
+Lens and motion blur are applied to the whole picture, followed by noise, clipping, the sRGB curve
+and JPEG.
 """
 
 import math
@@ -33,10 +33,10 @@ from heliotrope.optics.coverage import coverage
 Light = npt.NDArray[np.float32]
 Picture = npt.NDArray[np.uint8]
 
-#: Blue, green, red of sky, ground and lamp, relative.
+#: Relative blue, green and red of sky, ground and lamp.
 SKY_TINT, GROUND_TINT, LED_TINT = (1.25, 1.0, 0.80), (0.72, 0.95, 1.15), (1.0, 1.0, 1.0)
 _TEXTURE, _TEXEL = 1024, 0.04
-#: Light of a coded target's sheet and ink, full scale.
+#: Light of a coded target's sheet and ink, as fractions of full scale.
 PAPER, INK = 0.55, 0.02
 
 
@@ -47,30 +47,30 @@ class Conditions:
     Attributes
     ----------
     sky
-        Light from the sky at 45° of elevation, full scales.
+        Light from the sky at 45° elevation, as a fraction of full scale.
     ground
-        Mean light from the ground.
+        Mean light from the ground, as a fraction of full scale.
     contrast
         Relative standard deviation of the ground's texture.
     sun
         Azimuth and elevation of the sun, rad, for shadows; None for no shadows.
     led
-        Light of the lamp's reflection in a flat mirror with lamp and camera 100 m away, as the sum
-        over its pixels. It decreases with the square of the distance.
+        Light of the lamp's reflection, summed over its pixels, for a flat mirror with the lamp and
+        the camera 100 m away. The light decreases with the square of the distance.
     led_spread
         Standard deviation of the lamp's spot on the mirror due to the roughness of the glass, m.
     blur
         Standard deviation of the lens blur, pixels.
     motion
-        Motion of the image during the exposure, pixels right and down.
+        Motion of the image during the exposure, pixels to the right and down.
     electrons
-        Electrons at full scale.
+        Number of electrons at full scale.
     read_noise
         Electrons.
     quality
         JPEG quality, 1 to 100.
     clouds
-        Relative standard deviation of the sky's light due to clouds; each facet shows a uniform
+        Relative standard deviation of the sky's light due to clouds. Each facet shows a uniform
         value.
     speed, exposure
         Speed of the drone to the right, m/s, and exposure time, s, during which the image moves.
@@ -149,7 +149,8 @@ def render(
     camera, photo
         Lens, and true exterior orientation.
     lamp
-        The lamp's reflections in this photograph: ``heliostat`` is the row in the scene.
+        The lamp's reflections in this photograph; ``heliostat`` is the index of the mirror in the
+        scene.
     seed
         Seed of the noise, 0 or more.
     """
@@ -175,7 +176,7 @@ def sky_light(ray: npt.ArrayLike, conditions: Conditions) -> FloatArray:
     up = np.clip(unit[..., 2], 0.0, 1.0)
     light = conditions.sky * (1.0 + 0.5 * (math.sqrt(0.5) - up))
     if conditions.clouds > 0.0:
-        # A layer of clouds; its texture repeats every 0.5 rad overhead.
+        # The texture of the cloud layer repeats every 0.5 rad overhead.
         cell = unit[..., :2] / np.maximum(up, 0.05)[..., None] * (2 * _TEXTURE)
         i, j = np.moveaxis(np.floor(cell).astype(np.intp) % _TEXTURE, -1, 0)
         light = light * np.clip(1.0 + conditions.clouds * _texture()[i, j], 0.2, 1.7)
@@ -205,7 +206,7 @@ def _ground(camera: LedCamera, photo: Photo, scene: FlightScene) -> Light:
     plane = undistort(camera, grid)
     rays = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) @ photo.rotation.T
     down = -rays[..., 2] / np.linalg.norm(rays, axis=-1)
-    # Rays to the horizon or above it see haze.
+    # Rays to the horizon or above see haze.
     depth = (photo.position[2] - scene.ground) / np.maximum(-rays[..., 2], 0.02)
     place = (photo.position[:2] + depth[..., None] * rays[..., :2]) / _TEXEL
     place = np.mod(place - place.min(axis=(0, 1)), 1e7).astype(np.float32)
@@ -243,7 +244,7 @@ def _shadows(image: Light, camera: LedCamera, photo: Photo, scene: FlightScene) 
 
 
 def _target(image: Light, camera: LedCamera, photo: Photo, target: CodedTarget) -> None:
-    """Draw a coded target: white sheet, black square, white cells."""
+    """Draw a coded target with its white sheet, black square and white cells."""
     rows, columns = np.nonzero(white_cells(target.number))
     low = np.array([-SHEET_MARGIN, 0.0, *columns])
     top = np.array([-SHEET_MARGIN, 0.0, *rows])
@@ -282,7 +283,7 @@ def _mirror(image: Light, camera: LedCamera, photo: Photo, scene: FlightScene, r
 
 
 def _cover(image: Light, outline: FloatArray, colour: FloatArray, strength: float) -> None:
-    """Blend a colour over the pixels of a polygon (K, 2), each by its covered fraction."""
+    """Blend a colour over a polygon (K, 2), into each pixel by its covered fraction."""
     height, width = image.shape[:2]
     low = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 1, 0)
     high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 2, [width, height])
@@ -305,7 +306,7 @@ def _spot(
     if not np.isfinite(pixel).all():
         return
     distance = float(np.linalg.norm(place - photo.position))
-    # Below a third of a pixel the width no longer matters.
+    # Below a third of a pixel, the width of the spot no longer matters.
     sigma = max(scene.conditions.led_spread * camera.focal / distance, 0.3)
     reach = math.ceil(4.0 * sigma) + 1
     x, y = (np.arange(round(c) - reach, round(c) + reach + 1) for c in pixel.tolist())
@@ -319,7 +320,7 @@ def _spot(
 
 
 def _bell(cells: npt.NDArray[np.intp], center: float, sigma: float) -> FloatArray:
-    """Return the fraction of a normal distribution in each cell of width 1."""
+    """Return the fraction of a normal distribution that falls in each cell of width 1."""
     from scipy.special import ndtr
 
     edges = np.concatenate([cells - 0.5, cells[-1:] + 0.5])
@@ -383,7 +384,7 @@ def write_photo(
     origin: tuple[float, float, float],
     quality: int = 95,
 ) -> None:
-    """Write a JPEG with the drone's metadata in EXIF and DJI's XMP.
+    """Write a JPEG with the drone's metadata in EXIF and in DJI's XMP.
 
     Parameters
     ----------
@@ -436,7 +437,7 @@ def render_flight(
     seed: int = 0,
     progress: Any = None,
 ) -> Reflections:
-    """Write the photographs, camera and commands of a flight; return the true reflections.
+    """Write the photographs, camera and commands of a flight; return its true reflections.
 
     Parameters
     ----------
@@ -447,7 +448,7 @@ def render_flight(
     origin
         See `write_photo`.
     conditions
-        Light, lens and sensor; by default those of a clear day.
+        Light, lens and sensor; default: a clear day.
     seed
         Seed of the noise.
     progress

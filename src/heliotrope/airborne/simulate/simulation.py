@@ -1,10 +1,10 @@
-"""A simulated flight with its ground truth: the true mirror poses, and the drone's records.
+"""Simulate a flight with its ground truth: the true mirror poses, and the drone's records.
 
-A flight exists in two versions. *True*: mechanisms with imperfections, surveyed positions with
-errors, facets with slope errors, the actual camera positions. *Recorded*: the plant file, the
-commands, and for each photograph an RTK position and the gimbal angles. `fly` creates both;
-`reflections_of` returns the reflections that an image evaluation would find, without images;
-`heliotrope.airborne.simulate.rendering` renders the images.
+A flight exists in two versions. The *true* version has mechanisms with imperfections, surveyed
+positions with errors, facets with slope errors, and the actual camera positions. The *recorded*
+version has the plant file, the commands, and for each photograph an RTK position and the gimbal
+angles. `fly` creates both; `reflections_of` returns the reflections that an image evaluation would
+find, without images; `heliotrope.airborne.simulate.rendering` renders the images.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ from heliotrope.field.heliostats import Heliostats
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize, rotation
 from heliotrope.mechanism.tracking import TrackingStatus, track
 
-#: Standard deviations of roughly aligned mechanisms, rad.
+#: Standard deviations of the parameters of roughly aligned mechanisms, rad.
 ADJUSTED: Mapping[str, float] = {
     "tilt_north": 1e-3,
     "tilt_east": 1e-3,
@@ -36,14 +36,15 @@ ADJUSTED: Mapping[str, float] = {
 
 @dataclass(frozen=True)
 class Errors:
-    """Standard deviations of the recorded values from the truth; the offset is a value.
+    """Standard deviations of recorded minus true values; ``rtk_offset`` is a fixed value.
 
     Attributes
     ----------
     rtk
-        Error of each position east, north, up, independent from photograph to photograph, m, (3,).
+        Error of each position to the east, to the north and up, independent for each photograph, m,
+        (3,).
     rtk_offset
-        Recorded minus true, the same in all photographs, m, (3,).
+        Recorded minus true position, the same in all photographs, m, (3,).
     gimbal
         Error of each of three rotations of the camera, rad.
     survey
@@ -55,7 +56,7 @@ class Errors:
     reflection
         Error of the detected position of a reflection on the mirror, x and y, m.
     mechanism
-        Errors of parameters of the mechanisms, rad.
+        Errors of the mechanism parameters, rad.
     kinematics
         Error of each coordinate of a vertex in one pose, in addition to mechanism and survey
         errors, m.
@@ -90,7 +91,8 @@ class Errors:
                 raise InputError(f"errors: {name} must be 0 or more, not {value}")
 
 
-#: Those of a real flight: survey, kinematics and maps as HelioPoint states them, the rest is ours.
+#: Errors of a real flight. Survey, kinematics and maps are as HelioPoint states them; the rest is
+#: ours.
 REAL = Errors(survey=0.010, kinematics=0.030, canting=0.3e-3, map_error=0.1e-3, lens=0.5, hover=0.1)
 
 
@@ -109,7 +111,7 @@ class Flight:
     truth
         True poses of the mirrors.
     shapes
-        Their surfaces with slope deviations, N in total.
+        Surfaces of the N mirrors, with slope deviations.
     taken
         Photographs with their true exterior orientation.
     recorded
@@ -151,7 +153,7 @@ def look_counts(heliostats: Heliostats, point: npt.ArrayLike) -> FloatArray:
     mechanism = heliostats.calibrated
     vertex = mechanism.position
     for _ in range(4):
-        # A mirror faces the point to which it returns light; its vertex moves with the pose.
+        # A mirror faces the point to which it returns light, and its vertex moves with the pose.
         result = track(mechanism, normalize(to - vertex), to)
         vertex = result.chosen(result.vertex)
     status = result.chosen(result.status)
@@ -173,7 +175,7 @@ def hover_grid(
     center
         Middle of the pattern, ENU metres.
     focus
-        Point that the camera looks at.
+        Point at which the camera looks.
     columns, rows
         Number of positions horizontally and along the slope.
     step
@@ -205,7 +207,7 @@ def fly(
     installed: Installed | None = None,
     flight: int = 0,
 ) -> Flight:
-    """Return a flight over heliostats with its truth; the same seed gives the same flight.
+    """Return a flight over heliostats with its truth; equal seeds produce equal flights.
 
     Parameters
     ----------
@@ -222,7 +224,7 @@ def fly(
     errors
         Standard deviations; by default those of `Errors`.
     focal
-        Focal length of the facets, m; inf if flat.
+        Focal length of the facets, m; inf for flat facets.
     start, interval
         Time of the first photograph, and interval between photographs, s.
     seed
@@ -247,8 +249,8 @@ def fly(
         _photograph(f"DJI_{k + 1:04d}.JPG", time, place, as_float(focus), applied, rng)
         for k, (time, place) in enumerate(zip(times, places, strict=True))
     ]
-    # Drawn last, so that flights without these errors stay the same as before these errors were
-    # added.
+    # These errors are drawn last, so that flights without them are the same as before the errors
+    # were added.
     stand = standing(really, counts)
     if applied.kinematics > 0.0:
         off = applied.kinematics * rng.normal(0.0, 1.0, stand.vertex.shape)
@@ -303,7 +305,8 @@ def install(
     rows
         Indices in the field.
     errors, focal, seed
-        See `fly`. The truth about a heliostat does not depend on which others are requested.
+        See `fly`. The truth about a heliostat does not depend on which other heliostats are
+        requested.
     """
     index = np.asarray(rows, dtype=np.intp)
     really = _installed(heliostats, errors, np.random.default_rng(seed)).take(index)
@@ -328,7 +331,7 @@ def _shape(
     if errors.slope > 0.0:
         slope = smooth_slopes(shape, rng, errors.slope, length=errors.slope_length)
     if errors.canting > 0.0:
-        # As a slope of the whole facet, so that a map shows it like deflectometry does.
+        # Canting is a slope of the whole facet, so that a map shows it as deflectometry does.
         turn = errors.canting * rng.normal(0.0, 1.0, (len(shape), 2))
         area = np.prod(shape.half_size, axis=-1)
         slope = slope + (turn - (area / area.sum()) @ turn)[:, None, None, :]
@@ -356,7 +359,7 @@ def _photograph(
     """Return a photograph with its true orientation, and as the drone records it."""
     if errors.hover > 0.0:
         place = place + errors.hover * rng.normal(0.0, 1.0, 3)
-    # The drone steers by its own RTK, so it records the position that it was sent to.
+    # The drone steers by its own RTK, so it records the position to which it was sent.
     true = place - np.asarray(errors.rtk_offset) + rng.normal(0.0, 1.0, 3) * errors.rtk
     attitude = look_at(place, focus)
     lean = errors.gimbal * rng.normal(0.0, 1.0, 3)
@@ -368,7 +371,7 @@ def _photograph(
 
 
 def exact_reflections(flight: Flight) -> Reflections:
-    """Return every reflection of the flight by the exact law of reflection, at true positions.
+    """Return every reflection of a flight, from the exact law of reflection at true positions.
 
     ``sigma`` is 1e-9 m. Obstruction by other mirrors is ignored.
     """
@@ -404,9 +407,9 @@ def reflections_of(
     flight
         A flight simulated by `fly`.
     errors
-        Only ``reflection`` is used: noise of the positions on the mirror.
+        Errors, of which only ``reflection``, the noise of the positions on the mirror, is used.
     seed
-        Seed of that noise.
+        Seed of the noise.
     corrected
         Whether the common RTK offset is known and removed, as in an evaluation of images. The
         camera attitude, which determines the lamp position, is known to 0.1 mrad from the images

@@ -1,7 +1,7 @@
-"""Trials on simulated reflections: how many photographs a flight needs, and how accurate it is.
+"""Run trials on simulated reflections to find a flight's accuracy and number of photographs.
 
-One mirror is measured repeatedly, each time with different slope errors, positions and noise. As
-the truth is known, the true error can be compared with the stated error.
+One mirror is measured repeatedly, each time with different slope errors, positions and noise.
+Because the truth is known, the true error can be compared with the stated error.
 """
 
 from dataclasses import dataclass, field, replace
@@ -22,14 +22,14 @@ _NINETY = 1.6448536269514722
 
 @dataclass(frozen=True)
 class TrialConditions:
-    """Settings of a flight over one mirror; m and rad, standard deviations per axis.
+    """Settings of a flight over one mirror, in m and rad; errors are standard deviations per axis.
 
     Attributes
     ----------
     distance
         Distance from mirror to drone.
     columns, rows
-        Number of hover positions, which extend two slope errors beyond the mirror's edge.
+        Numbers of hover positions, which extend beyond the mirror's edge by twice the slope error.
     slope, length
         RMS of each component of the slope deviations, and their correlation length.
     rtk
@@ -92,7 +92,7 @@ class TrialMirror:
 
 @dataclass(frozen=True)
 class Trials:
-    """K trials, rad; rotX and rotY.
+    """Results of K trials, rotX and rotY, rad.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ def four_facets() -> MirrorShape:
 
 
 def trial_mirror(shape: MirrorShape, conditions: TrialConditions, seed: int) -> TrialMirror:
-    """Return a mirror of the given ideal shape with random slopes, measured once."""
+    """Return a mirror with the ideal shape ``shape`` and random slopes, measured once."""
     c, rng = conditions, np.random.default_rng(seed)
     real = shape
     if c.slope > 0.0:
@@ -138,15 +138,16 @@ def trial_mirror(shape: MirrorShape, conditions: TrialConditions, seed: int) -> 
     expected_vertex = np.array([0.0, 100.0, 3.0])
     shift = np.hypot(c.budget.position, c.budget.kinematics) * rng.standard_normal(3)
     vertex = expected_vertex + shift
-    # The reflection moves over the mirror with the drone, less where the mirror focuses.
+    # The reflection moves over the mirror with the drone, but less if the mirror focuses.
     corners = shape.corners[..., :2].reshape(-1, 2)
     narrow = abs(1.0 - c.distance / (2.0 * float(shape.focal.mean())))
-    # Beyond the edge, so that parts of the surface that lean outwards are not missed.
+    # Positions extend beyond the edge, so that parts of the surface that lean outwards are not
+    # missed.
     half = narrow * 0.5 * np.ptp(corners, axis=0) + 2.0 * c.slope * c.distance
     places = np.stack(np.meshgrid(_line(c.columns) * half[0], _line(c.rows) * half[1]), axis=-1)
     places = places.reshape(-1, 2) + c.hover * rng.standard_normal((c.columns * c.rows, 2))
     own = np.concatenate([places, np.full((len(places), 1), c.distance)], axis=-1)
-    # Roughly the mirror's true direction, which a first photograph would show.
+    # This is roughly the mirror's true direction, which a first photograph would show.
     camera = expected_vertex + own @ true.T
     led = camera + c.lamp * right
     points = reflection_points(real, true, vertex, camera, led)
@@ -192,7 +193,7 @@ def trials(
     Raises
     ------
     InputError
-        If no position shows a reflection.
+        If no hover position shows a reflection.
     """
     ideal = shape or four_facets()
     bare = replace(conditions.budget, position=0.0, kinematics=0.0)

@@ -1,4 +1,4 @@
-"""Compiled: the maximum a posteriori fit of each heliostat in turn.
+"""Compiled kernels: the maximum a posteriori fit of each heliostat in turn.
 
 Levenberg-Marquardt minimises Σ ρ(|r|²) + |y|², where r holds the two whitened components of normal
 minus bisector, and y = x / σ are the parameters scaled by their priors. In these units the prior is
@@ -30,28 +30,30 @@ SQUARE = 0
 HUBER = 1
 CAUCHY = 2
 
-#: Widths of the Huber and Cauchy losses in standard deviations: 95 % efficient for Gaussian noise
-#: in one dimension.
+#: Widths of the Huber and Cauchy losses in standard deviations. With these widths both are 95 %
+#: efficient for one-dimensional Gaussian noise.
 HUBER_WIDTH, CAUCHY_WIDTH = 1.345, 2.385
-#: Weight of the sightings' stated sigma in the estimate of the scale, degrees of freedom.
+#: Weight of the sightings' stated sigma in the estimate of the scale, as a number of degrees of
+#: freedom.
 PRIOR_FREEDOM = 5.0
-#: Converged when the quadratic model puts the minimum nearer than this, in standard deviations of
-#: the parameters.
+#: The fit has converged when the quadratic model puts the minimum closer than this, in standard
+#: deviations of the parameters.
 NEAR = 1e-7
-#: The same while the scale is still being estimated.
+#: The same limit while the scale is still being estimated.
 ROUGHLY = 1e-6
-#: A step with a smaller predicted gain is accepted unchecked: rounding of the cost hides the gain.
+#: A step with a smaller predicted gain is accepted unchecked, because rounding of the cost hides
+#: it.
 UNSEEN = 1e-9
-#: Damping after the first refused step, its growth, and the most refusals.
+#: Damping after the first refused step, its factor per further refusal, and the most refusals.
 DAMPING, HARDER, REFUSALS = 1e-3, 8.0, 25
 
 
 @njit(**INNER)
 def loss_and_weights(square, loss):
-    """Loss ρ(s), its derivative ρ', and the contribution of the curvature 2 ρ'' along the residual.
+    """Return the loss ρ(s), its derivative ρ', and its curvature along the residual, 2 ρ''.
 
-    Far out the loss is concave along the residual; there the curvature is taken as 0, which
-    keeps the matrix of the step positive definite.
+    For large residuals the loss is concave along the residual. The curvature is then taken as 0, so
+    that the matrix of the step stays positive definite.
     """
     if loss == HUBER and square > HUBER_WIDTH * HUBER_WIDTH:
         size = math.sqrt(square)
@@ -69,7 +71,7 @@ def loss_and_weights(square, loss):
 
 @njit(**INNER)
 def cholesky_solve(matrix, right, factor, out):
-    """Solve matrix · out = right; returns False if the matrix is not positive definite."""
+    """Solve matrix · out = right; return False if the matrix is not positive definite."""
     size = matrix.shape[0]
     for i in range(size):
         for j in range(i + 1):
@@ -97,7 +99,7 @@ def cholesky_solve(matrix, right, factor, out):
 
 @njit(**INNER)
 def inverse_from(factor, out):
-    """Inverse of factor · factorᵀ; only the lower half of ``factor`` is read."""
+    """Compute the inverse of factor · factorᵀ; only the lower half of ``factor`` is read."""
     size = factor.shape[0]
     lower = np.empty((size, size))
     for j in range(size):
@@ -118,11 +120,11 @@ def inverse_from(factor, out):
 
 @njit(**INNER)
 def _normal_equations(problem, y, loss, scale, curved, hessian, gradient):
-    """Cost at y, its gradient (P,) and the lower half of its Hessian (P, P) with respect to y.
+    """Return the cost at y; fill its gradient (P,) and the lower half of its Hessian (P, P) in y.
 
     The Hessian is the Gauss-Newton approximation weighted by the loss, from which the covariance is
-    also computed. ``curved`` = 1.0 adds the curvature of the loss, which yields a better step (a
-    float, because numba would compile a kernel per bool).
+    also computed. ``curved`` = 1.0 adds the curvature of the loss, which yields a better step. It
+    is a float because numba would compile one kernel for each bool.
     """
     base, codes, sigma, rows, data, squares, scratch, wrenches, jacobian = problem
     size = codes.shape[0]
@@ -159,9 +161,9 @@ def _normal_equations(problem, y, loss, scale, curved, hessian, gradient):
 
 @njit(**INNER)
 def _minimise(problem, y, loss, scale, near, arrays, limit):
-    """Levenberg-Marquardt from y, in place; returns (cost, iterations, converged).
+    """Run Levenberg-Marquardt from y, in place; return (cost, iterations, converged).
 
-    The prior keeps the matrix well-posed, so that damping begins only with a refusal.
+    Because the prior keeps the matrix well conditioned, damping begins only after a refused step.
     """
     hessians, gradients, damped, factor, step, trial = arrays
     size = y.shape[0]
@@ -210,7 +212,7 @@ def _minimise(problem, y, loss, scale, near, arrays, limit):
 
 @njit(**INNER)
 def _median_scale(squares, keep, rows):
-    """Robust scale of residual lengths: the median of Rayleigh noise is 1.1774 σ."""
+    """Return the robust scale of residual lengths; the median of Rayleigh noise is 1.1774 σ."""
     kept = 0
     for i in range(rows[0], rows[1]):
         kept += keep[i]
@@ -225,7 +227,7 @@ def _median_scale(squares, keep, rows):
 
 @njit(**INNER)
 def _covariance(hessian, sigma, gradient, factor, step, out):
-    """Covariance of x = y σ, (P, P); ``out`` is unchanged if the matrix is singular."""
+    """Compute the covariance of x = y σ, (P, P), unless the Hessian is singular."""
     if cholesky_solve(hessian, gradient, factor, step):
         inverse_from(factor, out)
         for p in range(sigma.shape[0]):
@@ -256,14 +258,14 @@ def fit_block(
 ):
     """Fit heliostats ``start`` to ``stop``.
 
-    ``offsets`` (N + 1,) delimit the sightings of each; ``rounds`` is the number of estimates of
-    the scale of the residuals (0: it stays 1).
+    ``offsets`` (N + 1,) delimit the sightings of each heliostat. ``rounds`` is how often the scale
+    of the residuals is estimated; with 0 rounds the scale stays 1.
     """
     size, joints = codes.shape[0], arrays[2].shape[1]
     drives = arrays[6].shape[0]
     scratch = scratch_mechanism(joints, drives, arrays[5].shape[2], size)
     wrenches, jacobian = np.empty((3, 2, 6)), np.empty((2, size))
-    # Matrices of the present point and of the trial; they swap when the trial is accepted.
+    # Matrices at the present point and at the trial point, swapped when the trial is accepted.
     solver = (
         np.empty((2, size, size)), np.empty((2, size)), np.empty((size, size)),
         np.empty((size, size)), np.empty(size), np.empty(size),
@@ -291,8 +293,8 @@ def fit_block(
                 cost, steps, converged = _minimise(problem, y, kind, scale, near, solver, limit)
                 total += steps
                 if turn < rounds:
-                    # With few sightings the residuals are too small, so the stated sigma is blended
-                    # in.
+                    # With few sightings the residuals understate the noise, so the stated sigma is
+                    # blended in.
                     free = max(0.0, 2.0 * kept - size)
                     new = _median_scale(squares, keep, rows)
                     total_square = PRIOR_FREEDOM + 2.0 * kept * new * new * (free > 0.0)

@@ -1,14 +1,15 @@
-"""Compiled: the whitened residual of each sighting, with its derivative.
+"""Compiled kernels: the whitened residual of each sighting, with its derivative.
 
 With n the normal, b the bisector, f_k the whitened axes and r_k = f_k·(n − b),
 
     dr_k = f_k·dn − g_k·dm,   g_k = (∂b/∂m)ᵀ f_k.
 
-A parameter moves everything beyond its joint as a rigid body, dn = w × n and dm = w × m + d with a
-twist (w, d), or translates it, w = 0. Hence dr_k = w·q_k − d·g_k with q_k = n × f_k − m × g_k, the
-product of a twist (from the heliostat) and a wrench (q_k, g_k) (from the sighting). Twists are
-taken at zero joint angles. Beyond a driven joint they would rotate with the joint; instead the
-wrench is rotated back, so that three wrenches serve all parameters.
+A parameter either moves everything beyond its joint as a rigid body, dn = w × n and dm = w × m + d
+with a twist (w, d), or only translates everything beyond it, w = 0. Hence dr_k = w·q_k − d·g_k with
+q_k = n × f_k − m × g_k, the product of a twist, which depends on the heliostat, and a wrench (q_k,
+g_k), which depends on the sighting. Twists are computed at zero joint angles. Beyond a driven joint
+they would rotate with the joint; instead the wrench is rotated back, so that three wrenches serve
+all parameters.
 """
 
 import math
@@ -39,7 +40,7 @@ from heliotrope.mechanism.kernels.vectors import about, across, add, cross, dot,
 
 @njit(**INNER)
 def apply_parameters(codes, x, position, origins, angles, drives, vertex, normal):
-    """Move the arrays of one mechanism by x (P,), in place."""
+    """Shift the arrays of one mechanism by the parameters x (P,), in place."""
     for p in range(codes.shape[0]):
         what, index, sub = codes[p, 0], codes[p, 1], codes[p, 2]
         if what == MOVES_JOINT:
@@ -59,10 +60,10 @@ def apply_parameters(codes, x, position, origins, angles, drives, vertex, normal
 
 @njit(**OPTIONS)
 def scratch_mechanism(joints, drives, slots, size):
-    """Arrays for one moved mechanism, its pose at zero joint angles, and P twists.
+    """Return arrays for one displaced mechanism, its pose at zero joint angles, and P twists.
 
-    A twist is (w, d); its entry in the layout holds the number of driven joints before it, its
-    drive (−1: none) and its slot.
+    A twist is (w, d). Its entry in the layout holds the number of driven joints before it, the
+    index of its drive (−1 if it has none) and its slot.
     """
     moved = (
         np.empty(3), np.empty((joints, 3)), np.empty(joints), np.empty((1, drives, slots)),
@@ -100,7 +101,7 @@ def _row(table, i):
 
 @njit(**INNER)
 def place_mechanism(base, codes, sigma, y, scratch):
-    """Move a mechanism by y σ, fill drives and twists; return its armature."""
+    """Shift a mechanism by y σ, fill drives and twists, and return the axes, vertex and normal."""
     orientation, axes, driven, normal = base[1], base[2], base[6], base[8]
     moved, pose, twists, places = scratch
     position_, origins_, angles_, drives_, vertex_, x = moved
@@ -137,7 +138,7 @@ def place_mechanism(base, codes, sigma, y, scratch):
 
 @njit(**INLINED)
 def _twist(codes, p, factor, driven, pose, twists, places):
-    """Twist of parameter p at zero joint angles, times ``factor``."""
+    """Compute the twist of parameter p at zero joint angles, times ``factor``."""
     _, frames, screw_axes, screw_points, n, _ = pose
     what, index, sub = codes[p, 0], codes[p, 1], codes[p, 2]
     joint, drive = index, -1
@@ -167,7 +168,7 @@ def _twist(codes, p, factor, driven, pose, twists, places):
 
 @njit(**INLINED)
 def turns(drives, counts, i):
-    """Sines and cosines of both joint angles at counts ``i``."""
+    """Return the sines and cosines of both joint angles at counts ``i``."""
     theta_1 = drive_angle(load_drive(drives, 0, 0), counts[i, 0])
     if drives.shape[1] == 1:
         return math.sin(theta_1), math.cos(theta_1), 0.0, 1.0
@@ -177,7 +178,7 @@ def turns(drives, counts, i):
 
 @njit(**INLINED)
 def _direction(ends, far, i, m):
-    """Unit vector from m to an end, and 1 / distance (0 for a direction)."""
+    """Return the unit vector from m to an end, and 1 / distance (0 if the end is a direction)."""
     end = _row(ends, i)
     if far[i]:
         return end, 0.0
@@ -188,7 +189,7 @@ def _direction(ends, far, i, m):
 
 @njit(**INLINED)
 def _gap_axes(data, i, inverse):
-    """The two whitened axes f_k of sighting i, divided by the scale of the residuals."""
+    """Return the two whitened axes f_k of sighting i, divided by the scale of the residuals."""
     axes, whiten = data[5], data[6]
     a = (axes[i, 0, 0], axes[i, 0, 1], axes[i, 0, 2])
     b = (axes[i, 1, 0], axes[i, 1, 1], axes[i, 1, 2])
@@ -223,7 +224,7 @@ def _turn_back(axis, point, sine, cosine, q, g):
 
 @njit(**INLINED)
 def sighting_residual(g, drives, data, i, inverse, wrenches):
-    """Residual of sighting i divided by the scale; fills wrenches (3, 2, 6)."""
+    """Compute the residual of sighting i, divided by the scale; fill the wrenches (3, 2, 6)."""
     t = turns(drives, data[0], i)
     m = place_vertex(g, t)
     n = turned(g, t, (g[15], g[16], g[17]))
@@ -253,7 +254,7 @@ def sighting_residual(g, drives, data, i, inverse, wrenches):
 
 @njit(**INLINED)
 def residual_jacobian(drives, counts, i, scratch, wrenches, jacobian):
-    """Derivative (2, P) of sighting i's residual: twists times wrenches."""
+    """Compute the derivative (2, P) of sighting i's residual as twists times wrenches."""
     twists, places = scratch[2], scratch[3]
     for p in range(twists.shape[0]):
         k = places[p, 0]

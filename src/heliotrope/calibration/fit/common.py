@@ -8,13 +8,13 @@ common to all heliostats, and one rotation per mirror, in addition to the parame
 heliostat.
 
 Let H be the normal matrix of one heliostat's own unknowns, B its coupling with z, and C the
-covariance of z given all heliostats. The covariance of the own unknowns is then
+covariance of z given all heliostats. The covariance of the heliostat's own unknowns is then
 
 $$ H^{-1} + H^{-1} B\, C\, B^T H^{-1}, \qquad
    C^{-1} = C_0^{-1} + \sum_i (Z_i - B_i^T H_i^{-1} B_i) $$
 
-(Schur complement). The term of heliostat i in the sum is its `CommonFit.information`, the
-information that its own sightings provide about z.
+by the Schur complement. The term of heliostat i in the sum is its entry in `CommonFit.information`,
+which is the information that its sightings provide about z.
 """
 
 from collections.abc import Mapping
@@ -31,11 +31,12 @@ from heliotrope.field.formats.frames import mirror_frame
 from heliotrope.geometry import FloatArray, as_float, normalize, rotation
 from heliotrope.mechanism.chain import Mechanism
 
-#: Maximum number of rounds of fit and step; two or three suffice, because the unknowns are small.
+#: Maximum number of rounds, each a fit and a step of the common unknowns. Two or three rounds
+#: suffice, because the unknowns are small.
 _ROUNDS = 12
-#: The iteration ends when no common unknown changes by more than this share of its prior.
+#: The iteration ends when no common unknown changes by more than this fraction of its prior sigma.
 _SETTLED = 1e-3
-#: Standard deviation of a rotation that does not occur, rad; the rotation stays 0.
+#: Standard deviation that keeps a rotation at 0 where none occurs, rad.
 _NEVER = 1e-9
 
 
@@ -51,9 +52,9 @@ class CommonErrors:
     mean, covariance
         Prior knowledge of the shared errors: mean (K,), and covariance (K, K), positive definite.
     turned
-        Whether the slope deviations make the mirror appear rotated in this sighting, (M,).
+        Whether slope deviations make the mirror appear rotated in each sighting, (M,).
     turn_sigma
-        Standard deviation of that rotation about each of two mirror axes, rad, (N,); 0: no
+        Standard deviation of that rotation about each of two mirror axes, rad, (N,); 0 for no
         rotation.
     """
 
@@ -73,13 +74,12 @@ class CommonFit:
     fitted
         The fit; its covariance includes the common errors.
     turn, turn_covariance
-        Rotation about the mirror's x and y axes and its covariance, rad, (N, 2) and (N, 2, 2).
+        Rotation about the mirror's x and y axes, rad, (N, 2), and its covariance, rad², (N, 2, 2).
     shared, shared_covariance
         The K shared errors given these sightings, and their covariance.
     information, pull
-        Information that each heliostat's sightings provide about the shared errors: the
-        contribution to the inverse covariance, (N, K, K), and to the inverse covariance times the
-        mean, (N, K).
+        What each heliostat's sightings contribute to the inverse covariance of the shared errors,
+        (N, K, K), and to that inverse covariance times their mean, (N, K).
     sightings
         The sightings corrected for the errors that were found.
     """
@@ -145,7 +145,7 @@ def fit_common(
         shared,
         step.shared_covariance,
         step.information,
-        # The gradients are those at the shared errors before the step.
+        # The gradients were computed at the shared errors before the step.
         np.einsum("nkl,l->nk", step.information, shared - step.shared) + step.push,
         corrected,
     )
@@ -215,7 +215,7 @@ class _Step:
 
 
 def turned_back(flights: Sightings, mechanism: Mechanism, turn: FloatArray) -> Sightings:
-    """Return sightings without their mirrors' rotation, by rotating the rays about the vertices.
+    """Return sightings corrected for their mirrors' rotation, by rotating rays about the vertices.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def turned_back(flights: Sightings, mechanism: Mechanism, turn: FloatArray) -> S
 
 
 def derivative_by_turn(mechanism: Mechanism, sightings: Sightings) -> FloatArray:
-    """Return derivatives of whitened residuals with respect to the removed rotation, (M, 2, 2).
+    """Return the derivative of whitened residuals with respect to the removed rotation, (M, 2, 2).
 
     Parameters
     ----------
@@ -261,7 +261,7 @@ def derivative_by_turn(mechanism: Mechanism, sightings: Sightings) -> FloatArray
 def _axes(mechanism: Mechanism, counts: FloatArray) -> FloatArray:
     """Return the x and y axes of mirrors in ENU, (M, 2, 3)."""
     frame = mirror_frame(mechanism.normal)
-    # A mechanism rotates any direction fixed to the mirror in the same way as the normal.
+    # A mechanism rotates any direction fixed to the mirror just as it rotates the normal.
     right = replace(mechanism, normal=frame[..., 0]).pose(counts).normal
     up = np.cross(mechanism.pose(counts).normal, right)
     return np.stack([right, up], axis=1)
@@ -270,7 +270,7 @@ def _axes(mechanism: Mechanism, counts: FloatArray) -> FloatArray:
 def derivative_by_shared(
     mechanism: Mechanism, sightings: Sightings, shift: FloatArray
 ) -> FloatArray:
-    """Return derivatives of whitened residuals by the removed shared errors, (M, 2, K).
+    """Return the derivative of whitened residuals with respect to removed shared errors, (M, 2, K).
 
     Parameters
     ----------
@@ -303,7 +303,7 @@ def _without(
     turn: FloatArray,
     shared: FloatArray,
 ) -> Sightings:
-    """Return sightings without the common errors."""
+    """Return sightings corrected for the common errors."""
     moved = common.shift @ shared
     near = replace(
         sightings,

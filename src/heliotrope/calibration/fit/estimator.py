@@ -4,9 +4,10 @@ For each heliostat the fit finds the deviations x of the model's parameters that
 
 $$ \sum_i ρ(|W_i\,(n_i(x) - b_i(x))|^2 / s^2) + \sum_p (x_p / σ_p)^2 $$
 
-where n is the mechanism's normal, b the bisector of source and destination as seen from its vertex,
-W the whitening by the sighting's covariance, s the scale of the residuals (estimated from the
-residuals), ρ a robust loss and σ the priors from the parameter table.
+where n is the mirror normal that the mechanism predicts, b the bisector of source and destination
+as seen from the mirror vertex, W the matrix that whitens by the sighting's covariance, s the scale
+of the residuals (estimated from the residuals themselves), ρ a robust loss and σ the prior standard
+deviations from the parameter table.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,7 +43,7 @@ from heliotrope.values import Card, Value, amount
 Loss = Literal["square", "huber", "cauchy"]
 _LOSSES = {"square": kernels.SQUARE, "huber": kernels.HUBER, "cauchy": kernels.CAUCHY}
 
-#: The start is searched globally if the nominal mechanism misses by more than this, rad.
+#: If the nominal mechanism misses by more than this, rad, starting values are searched globally.
 FAR = 0.15
 
 
@@ -59,7 +60,7 @@ class FitOutcome(IntEnum):
 
     @property
     def text(self) -> str:
-        """The outcome in one clause, for display."""
+        """Return the outcome in one clause, for display."""
         return _TEXTS[self]
 
 
@@ -76,7 +77,7 @@ _TEXTS = {
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FieldFit(Value, Framed):
-    """Fitted parameters of N heliostats, P each; without the axis N if one mechanism was fitted.
+    """Fitted parameters of N heliostats, or of a single mechanism without the axis N.
 
     Attributes
     ----------
@@ -96,7 +97,7 @@ class FieldFit(Value, Framed):
     count
         Number of sightings used, (N,).
     iterations, outcome
-        (N,); `FitOutcome` as integers.
+        Number of iterations, and `FitOutcome` as an integer, (N,).
     centre
         Centre of the priors, (N, P): zero, or a start value far from nominal.
     heliostats
@@ -160,16 +161,16 @@ class FieldFit(Value, Framed):
 
     @property
     def parameters(self) -> dict[str, FloatArray]:
-        """Values by name, each (N,), as `Mechanism.with_calibration` takes them."""
+        """Return the values by name, (N,) each, in the form that `with_calibration` accepts."""
         return {name: self.values[..., p] for p, name in enumerate(self.names)}
 
     @property
     def sigma(self) -> FloatArray:
-        """Standard deviations of the values, (N, P)."""
+        """Return the standard deviations of the values, (N, P)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
 
     def __getitem__(self, heliostat: int | str) -> "FieldFit":
-        """Return the fit of one heliostat, by name or index, without the axis N.
+        """Return the fit of one heliostat, given by name or index, without the axis N.
 
         Raises
         ------
@@ -190,7 +191,7 @@ class FieldFit(Value, Framed):
         return self.of_one(heliostat) if np.ndim(self.scale) else self
 
     def only(self, row: int) -> "FieldFit":
-        """Return the fit of one heliostat, keeping the axis N, (1,)."""
+        """Return the fit of one heliostat, keeping the axis N with length 1."""
         mine = self.rows == row
         values = {name: getattr(self, name)[row : row + 1] for name in BY_HELIOSTAT}
         rows = np.zeros(int(mine.sum()), dtype=np.int64)
@@ -219,7 +220,7 @@ BY_HELIOSTAT = (
 def parameter_rows(
     names: tuple[str, ...], values: FloatArray, sigma: FloatArray
 ) -> list[tuple[str, str, str]]:
-    """Return a row for each parameter: name, median of values (N, P) and of sigmas, with unit."""
+    """Return one table row per parameter, with the median value and the median sigma."""
     rows = []
     for p, name in enumerate(names):
         scale, unit = parameter_table.shown_in(name)
@@ -231,7 +232,7 @@ def parameter_rows(
 
 
 def is_compiled() -> bool:
-    """Whether the kernels of a fit need not be compiled first."""
+    """Return whether the fit kernels are already compiled."""
     return jit.is_compiled(kernels.fit_block)
 
 
@@ -251,8 +252,8 @@ def fit(
     Parameters
     ----------
     mechanism
-        The heliostats: their nominal mechanisms, batch shape (N,) or (); or ``plant[name]``, a
-        group, or a plant, whose nominal mechanisms are fitted.
+        Nominal mechanisms of the heliostats, batch shape (N,) or (); or ``plant[name]``, a group or
+        a plant, whose nominal mechanisms are then fitted.
     sightings
         Sightings of these heliostats, in any order.
     model
@@ -356,8 +357,8 @@ def _fit(
         count,
         minimum_rows=2,
     )
-    # The prior is centred on the start, because a zero that is off by a radian is a wrong entry in
-    # the plant file, not an improbable installation.
+    # The prior is centred on the start, because a drive zero that is off by a radian is a wrong
+    # entry in the plant file, not an improbable installation.
     result.values[:] += begin
     _reject(result, mechanism)
     result.lengths[order] = np.sqrt(squares) / result.scale[ordered.heliostat]
@@ -365,7 +366,7 @@ def _fit(
 
 
 def _reject(result: FieldFit, mechanism: Mechanism) -> None:
-    """Reject impossible parameters; the heliostat keeps its nominal parameters."""
+    """Reject impossible parameters, so that the heliostat keeps its nominal parameters."""
     most = np.array([mechanism.most(name) for name in result.names])
     beyond = ~(np.abs(result.values) <= most).all(axis=1)
     result.outcome[beyond & (result.outcome != FitOutcome.FAILED)] = FitOutcome.MISFIT
@@ -408,7 +409,7 @@ def names_of(model: str | Sequence[str], mechanism: Mechanism) -> tuple[str, ...
 
 
 def mask_of(selection: npt.ArrayLike | None, rows: int, name: str) -> npt.NDArray[np.bool_]:
-    """Return a mask of M sightings; None takes them all.
+    """Return a mask of M sightings; None selects all of them.
 
     Raises
     ------
@@ -451,12 +452,12 @@ def _priors(
 
 
 def canonical_order(s: Sightings) -> npt.NDArray[np.intp]:
-    """Return sighting indices by heliostat, then in an order independent of the input."""
+    """Return sighting indices sorted by heliostat, then in an order independent of the input."""
     first = (s.counts[:, -1], s.time, s.heliostat)
     order = np.lexsort(first)
     alike = np.ones(max(len(order) - 1, 0), dtype=np.bool_)
     for key in first:
-        # Unknown times count as equal.
+        # Unknown times compare as equal.
         alike &= ~(key[order[1:]] != key[order[:-1]]) | np.isnan(key[order[1:]].astype(float))
     if alike.any():
         more = (
@@ -469,7 +470,7 @@ def canonical_order(s: Sightings) -> npt.NDArray[np.intp]:
 
 
 def _data(s: Sightings, vertex: FloatArray, keep: npt.NDArray[np.bool_]) -> tuple[np.ndarray, ...]:
-    """The sightings as the kernels read them, with axes and whitening at the start."""
+    """Return the arrays that the kernels read, with axes and whitening at the starting values."""
     axes, whiten = np.zeros((len(s), 2, 3)), np.zeros((len(s), 2, 2))
     if len(s):
         axes, whiten = whitening(s, vertex)
@@ -489,12 +490,12 @@ def _far_starts(
     pose: Pose,
     names: tuple[str, ...],
 ) -> FloatArray:
-    """Starting values: 0, except for drive zeros and strokes where the nominal ones are far off.
+    """Return starting values: 0, except for drive zeros and strokes that are far off as stated.
 
-    Each sighting gives the joint angles at which the nominal axes would produce it. Comparing
-    them with the drives' own angles is one regression for each joint: the zero is the median of
-    the differences; for a jack the length at 0 counts is tried over the range that its triangle
-    allows. A start is used only where it explains the sightings far better.
+    For each sighting, the joint angles at which the nominal axes would produce it are computed.
+    These are compared with the drives' own angles by one regression per joint. The zero is the
+    median of the differences; for a jack, lengths at 0 counts are tried over the range that its
+    triangle allows. A start is used only where it explains the sightings far better.
     """
     begin = np.zeros((len(mechanism), len(names)))
     places = [_start_parameters(mechanism, names, d) for d in range(len(mechanism.driven))]
@@ -521,7 +522,7 @@ def _far_starts(
             ]
             for branch in (0, 1)
         ]
-        # Both joints are on the same branch; on the wrong one the zeros are off by half a turn.
+        # Both joints are on the same branch; on the wrong branch the zeros are off by half a turn.
         scores = [sum(f[0] * (1.0 + abs(f[1])) for f in both) for both in trials]
         for (zero, stroke), (_, shift, longer) in zip(
             places, trials[int(np.argmin(scores))], strict=True
@@ -548,13 +549,13 @@ def _regress(
         )
         low = abs(c - r) + 1e-3 + stroke - min(ends.min(), stroke)
         high = c + r - 1e-3 + stroke - max(ends.max(), stroke)
-        # Counts that span more than the triangle allows leave no length to try.
+        # If the counts span more than the triangle allows, there is no length to try.
         trials += list(np.linspace(low, high, 200) - stroke) if low < high else []
-    # All lengths at once: one after another they took a third of a search for the model.
+    # All lengths are tried at once; one after another, they took a third of a model search.
     table = np.tile(drive.table, (len(trials), 1, 1))
     table[..., SLOTS["stroke_offset"]] += np.array(trials)[:, None]
     gaps = wrap_signed(angles - Drive(table).angles(counts))
-    # A median of angles is defined once the circle is cut opposite to their mean direction.
+    # The median of angles is defined once the circle is cut opposite to their mean direction.
     centre = np.arctan2(np.sin(gaps).sum(axis=-1), np.cos(gaps).sum(axis=-1))
     rest = wrap_signed(gaps - centre[:, None])
     middle = np.median(rest, axis=-1)
@@ -571,7 +572,7 @@ def _regress(
 def _start_parameters(
     mechanism: Mechanism, names: tuple[str, ...], drive: int
 ) -> tuple[int | None, int | None]:
-    """Indices of a drive's zero and stroke among the names; None if absent."""
+    """Return the indices of a drive's zero and stroke among the names; None if absent."""
     joint = mechanism.joints[mechanism.driven[drive]]
 
     def place(*suffixes: str) -> int | None:

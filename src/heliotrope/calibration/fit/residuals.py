@@ -16,7 +16,7 @@ class Linearised:
     Attributes
     ----------
     residual
-        Normal minus bisector in the tangent plane, whitened by the sightings'
+        Normal minus bisector in the plane tangent to the bisector, whitened by the sightings'
         covariance, (M, 2).
     jacobian
         Derivative of the residual with respect to the named parameters, (M, 2, P).
@@ -31,7 +31,7 @@ class Linearised:
 
 
 def linearise(mechanism: Mechanism, s: Sightings, names: tuple[str, ...]) -> Linearised:
-    """Return residuals and derivatives of sightings ``s``.
+    """Return the residuals of sightings ``s`` and their derivatives.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def linearise(mechanism: Mechanism, s: Sightings, names: tuple[str, ...]) -> Lin
 
 
 def whitening(s: Sightings, vertex: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return axes of the tangent plane (M, 2, 3) and the matrices that whiten along them.
+    """Return axes of the tangent plane, (M, 2, 3), and matrices that whiten along these axes.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def whitening(s: Sightings, vertex: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def frame(direction: FloatArray) -> FloatArray:
-    """Return unit vectors to the right and up as seen along directions (M, 3), (M, 2, 3)."""
+    """Return unit vectors to the right and up, (M, 2, 3), as seen along directions (M, 3)."""
     right = np.stack([direction[:, 1], -direction[:, 0], np.zeros(len(direction))], axis=-1)
     right /= np.maximum(np.linalg.norm(right, axis=-1, keepdims=True), 1e-12)
     return np.stack([right, np.cross(right, direction)], axis=1)
@@ -100,7 +100,7 @@ def frame(direction: FloatArray) -> FloatArray:
 def _beam_map(
     axes: FloatArray, v: FloatArray, source: FloatArray, destination: FloatArray
 ) -> FloatArray:
-    """Change of the reflected ray by a change of the normal along the tangent axes, (M, 2, 2)."""
+    """Return the derivative of the reflected ray with respect to the normal, (M, 2, 2)."""
     # d(2 (n·s) n − s) = 2 ((dn·s) n + (n·s) dn)
     across = frame(destination)
     along = np.einsum("mak,mk->ma", axes, source)

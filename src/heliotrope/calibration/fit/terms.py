@@ -27,24 +27,24 @@ from heliotrope.geometry import FloatArray, as_float, as_numbers
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.values import Card, Value, amount
 
-#: Most rounds of fit and step; terms of milliradians need three or four.
+#: Maximum number of rounds of fit and step; terms of a few milliradians need three or four.
 _ROUNDS = 20
-#: The iteration ends when no coefficient changes by more than this share of its prior.
+#: The iteration ends when no coefficient changes by more than this fraction of its prior sigma.
 _SETTLED = 1e-4
-#: Rounds of the inversion; an error of slope s shrinks by s in each.
+#: Rounds of the inversion; each round reduces an error of slope s by the factor s.
 _INVERSION = 30
 
 
 @dataclass(frozen=True)
 class DriveTerm:
-    """A drive error that is linear in its coefficient.
+    """A drive error that is a coefficient times a given function of the joint angles.
 
     Attributes
     ----------
     name
         Name of the coefficient.
     joint
-        Driven joint to whose angle the term is added.
+        Driven joint; the term is added to its angle.
     shape
         Function of the angles of the D driven joints, rad, (..., D), that returns the error for a
         coefficient of 1, (...).
@@ -118,7 +118,7 @@ class TermFit(Value, Framed):
 
     @property
     def sigma(self) -> FloatArray:
-        """Standard deviations of the coefficients, (N, K)."""
+        """Return the standard deviations of the coefficients, (N, K)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
 
     def _card(self) -> Card:
@@ -153,7 +153,7 @@ class TermFit(Value, Framed):
         )
 
     def without_terms(self, sightings: Sightings) -> Sightings:
-        """Return the sightings with the counts at which ``mechanism`` alone has their poses."""
+        """Return sightings with the counts at which ``mechanism`` alone reaches the same poses."""
         sightings = self.original.rows_of(sightings)
         row = sightings.heliostat
         shapes = _shapes(self.terms, self.original.mechanism[row], sightings.counts)
@@ -161,7 +161,7 @@ class TermFit(Value, Framed):
         return replace(sightings, counts=moved)
 
     def to_send(self, heliostat: npt.ArrayLike, counts: npt.ArrayLike) -> FloatArray:
-        """Return the counts to send, (M, D), so that the mechanism with its terms reaches a pose.
+        """Return the counts, (M, D), with which the mechanism, including its terms, reaches a pose.
 
         Parameters
         ----------
@@ -194,7 +194,7 @@ def fit_terms(
     loss: Loss = "cauchy",
     adapt_scale: bool = True,
 ) -> TermFit:
-    """Return the maximum a posteriori parameters and the coefficients of drive error terms.
+    """Return the maximum a posteriori parameters, and the coefficients of drive error terms.
 
     Parameters
     ----------
@@ -256,13 +256,13 @@ def _check(mechanism: Mechanism, terms: Sequence[DriveTerm]) -> None:
 
 
 def _places(mechanism: Mechanism, terms: Sequence[DriveTerm]) -> list[int]:
-    """Return the drive of each term."""
+    """Return the index of the drive that each term belongs to."""
     driven = [mechanism.joints[d] for d in mechanism.driven]
     return [driven.index(term.joint) for term in terms]
 
 
 def _shapes(terms: Sequence[DriveTerm], nominal: Mechanism, counts: FloatArray) -> FloatArray:
-    """Return the error from each term for a coefficient of 1, (M, K)."""
+    """Return the error that each term produces with a coefficient of 1, (M, K)."""
     angles = nominal.drives.angles(counts)
     columns = []
     for term in terms:
@@ -286,7 +286,7 @@ def _moved(
     terms: Sequence[DriveTerm],
     values: FloatArray,
 ) -> FloatArray:
-    """Return the counts (M, D) at which mechanisms (M,) have the same pose without their terms."""
+    """Return the counts, (M, D), that produce the same poses without the terms."""
     angles = mechanism.drives.angles(counts)
     for k, drive in enumerate(_places(mechanism, terms)):
         angles[:, drive] += values[:, k] * shapes[:, k]
@@ -302,7 +302,7 @@ def _step(
     values: FloatArray,
     loss: Loss,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the Gauss-Newton step of the coefficients and the covariance of all unknowns."""
+    """Return the Gauss-Newton step of the coefficients, and the covariance of all unknowns."""
     count, row, p = len(mechanism), sightings.heliostat, len(fitted.names)
     biases = tuple(f"{term.joint}_bias" for term in terms)
     lines = linearise(mechanism[row], sightings, (*fitted.names, *biases))

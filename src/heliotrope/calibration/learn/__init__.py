@@ -1,11 +1,11 @@
-"""Learns a field: parameters, their drift over time, noise, steps, regimes and outliers.
+"""Learn a field: parameters, their drift over time, noise, steps, regimes and outliers.
 
-Begin with `learn`; `predict` and `assess` compare the result with sightings; `beliefs_of` turns it
-into a belief per heliostat, which `observe` updates with one sighting after another.
-`compare_models` and `choose_model` find the model of a field, `choose_own_model` that of one
-heliostat, and `search_periodic_errors` worms of unknown ratio. Learning on several computers
-(`calibration.learn.on_dask`) needs the optional dask.distributed and must be imported from its
-module.
+Begin with `learn`; `predict` and `assess` compare the result with sightings; `beliefs_of` converts
+the result into a belief for each heliostat, and `observe` updates a belief with one sighting after
+another. `compare_models` and `choose_model` find the model of a field, `choose_own_model` finds the
+model of one heliostat, and `search_periodic_errors` finds worm gears of unknown ratio. Learning on
+several computers needs the optional package dask.distributed and must be imported from the module
+`calibration.learn.on_dask`.
 """
 
 from heliotrope.calibration.learn.assessment import Assessment, HeliostatFigures, assess

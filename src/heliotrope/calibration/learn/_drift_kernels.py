@@ -1,4 +1,4 @@
-"""Compiled: covariances of sightings whose parameters drift, and quantities derived from them.
+"""Compiled kernels: covariances of sightings whose parameters drift, and derived quantities.
 
 The whitened residual of sighting i is −Σ_p J_ip x_p(t_i) + noise. Each x_p is a constant with a
 variance, plus an offset that lasts for one regime, plus Ornstein-Uhlenbeck processes with given
@@ -8,7 +8,7 @@ amplitudes and time constants. The covariance of two sightings is therefore
                             + Σ_c a_c² exp(−|t_i − t_j| / τ_c))
 
 where e is the number of zero steps before the sighting. A sighting at an unknown time (NaN) shares
-no drift with any other.
+no drift with any other sighting.
 """
 
 import math
@@ -38,11 +38,11 @@ def gram(
     amplitude,
     tau,
 ):
-    """K (2 n, 2 m) of sightings with Jacobians (n, 2, P) and (m, 2, P).
+    """Return K (2 n, 2 m) for two sets of sightings with Jacobians (n, 2, P) and (m, 2, P).
 
-    ``part`` (C,) is the parameter of each process, ``amplitude`` and ``tau`` (C,) belong to the
-    processes; ``same`` means that both sets are the same sightings, so that i = j shares its drift
-    even at an unknown time.
+    ``part``, ``amplitude`` and ``tau`` (C,) are the parameter, the amplitude and the time constant
+    of each process. ``same`` means that both sets are the same sightings, so that a sighting shares
+    drift with itself even if its time is unknown.
     """
     n, m, size = first.shape[0], second.shape[0], first.shape[2]
     out = np.empty((2 * n, 2 * m))
@@ -77,10 +77,10 @@ def gram(
 def _decaying_gram(
     jacobian, time, label, epoch, static, regime, step, part, group, amplitude, tau, decay
 ):
-    """As `gram` for one set of sightings; fills the lower half of ``decay`` (n, n, G).
+    """Return the matrix of `gram` for one set of sightings; fill the lower half of ``decay``.
 
-    Processes of one group have one time constant, so that one exponential serves them all. With
-    unknown times the decay is 0.
+    ``decay`` (n, n, G) holds one exponential per group, because the processes of a group have the
+    same time constant. It is 0 where a time is unknown.
     """
     n, size = jacobian.shape[0], jacobian.shape[2]
     out = np.empty((2 * n, 2 * n))
@@ -117,9 +117,11 @@ def _decaying_gram(
 def cost_and_gradient(
     jacobian, time, label, epoch, residual, static, regime, step, part, group, amplitude, tau, noise
 ):
-    """Negative log likelihood, and its gradient by log (noise, amplitudes (C,), times (G,)).
+    """Return the negative log likelihood and its gradient with respect to the logarithms.
 
-    ``group`` (C,) says which of the G times a process has; ``tau`` is (G,).
+    The logarithms are those of the noise, the amplitudes (C,) and the time constants (G,).
+
+    ``group`` (C,) says which of the G time constants ``tau`` (G,) a process has.
     """
     n, parts, times = len(residual), part.shape[0], tau.shape[0]
     decay = np.empty((n, n, times))
@@ -181,7 +183,7 @@ def pooled_block(
     start,
     stop,
 ):
-    """Cost and gradient of heliostats ``start`` to ``stop``, one per row."""
+    """Fill the cost and gradient of heliostats ``start`` to ``stop``, one heliostat per row."""
     for i in range(start, stop):
         a, b = offsets[i], offsets[i + 1]
         cost, gradient = cost_and_gradient(
@@ -206,10 +208,10 @@ def pooled_block(
 
 @njit(**OPTIONS)
 def step_sums(inverse, alpha, slope):
-    """Sums over each sighting and later ones: UᵀK⁻¹U (n, Z, Z) and UᵀK⁻¹r (n, Z).
+    """Return UᵀK⁻¹U (n, Z, Z) and UᵀK⁻¹r (n, Z), summed over each sighting and all later ones.
 
-    ``slope`` (n, 2, Z) are the derivatives with respect to the Z zeros; U are those from sighting k
-    onwards.
+    ``slope`` (n, 2, Z) holds the derivatives with respect to the Z drive zeros, and U those of the
+    sightings from k onwards.
     """
     n, size = slope.shape[0], slope.shape[2]
     totals, rights = np.zeros((n, size, size)), np.zeros((n, size))
@@ -240,10 +242,11 @@ def step_sums(inverse, alpha, slope):
 def step_gains(
     inverse: FloatArray, alpha: FloatArray, slope: FloatArray, variance: FloatArray
 ) -> FloatArray:
-    """Gain in log evidence by a step of the zeros before each sighting, sorted by time, (n,).
+    """Return the gain in log evidence from a step of the zeros before each sighting, (n,).
 
-    ``variance`` (Z,) is the variance of the step; no step precedes the first sighting. The gain is
-    −½ log |1 + V UᵀK⁻¹U| + ½ bᵀ(V⁻¹ + UᵀK⁻¹U)⁻¹ b, b = UᵀK⁻¹r (matrix determinant lemma).
+    The sightings are sorted by time. ``variance`` (Z,) is the variance of the step; no step
+    precedes the first sighting. The gain is −½ log |1 + V UᵀK⁻¹U| + ½ bᵀ(V⁻¹ + UᵀK⁻¹U)⁻¹ b, b =
+    UᵀK⁻¹r (matrix determinant lemma).
     """
     totals, rights = step_sums(inverse, alpha, slope)
     spread = totals + np.diag(1.0 / variance)

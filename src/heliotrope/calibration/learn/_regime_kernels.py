@@ -1,4 +1,4 @@
-"""Compiled: the optimal partition of a heliostat's history into regimes; see regimes.py."""
+"""Compiled kernels: the best partition of a heliostat's history into regimes; see regimes.py."""
 
 import math
 
@@ -8,21 +8,25 @@ from numba import njit
 from heliotrope.calibration.median import median
 from heliotrope.jit import INNER, OPTIONS
 
-#: Largest squared residual that counts, units of the noise: one bad sighting makes no regime.
+#: Larger squared residuals, in units of the noise, are limited to this value, so that one bad
+#: sighting does not make a regime.
 TRUNCATION = 16.0
-#: Gain that new zeros need (twice the BIC of 2 parameters), and the price of a cut.
+#: Gain that new zeros must bring (twice the BIC of 2 parameters), and the cost of a cut.
 PRICE, CUT = 16.0, 8.0
-#: Fewest sightings of a regime; two could be two mistakes.
+#: Minimum number of sightings in a regime; two sightings could both be mistaken.
 FEWEST = 3
 
 
 @njit(**INNER)
 def _segment(residual, jacobian, start, stop, shift):
-    """Cost of one segment with its own zeros, by reweighted least squares from the median."""
+    """Return the cost of one segment with its own zeros, by reweighted least squares.
+
+    The search starts from the median over the sightings.
+    """
     n = stop - start
     values = np.empty((2, n))
     for i in range(n):
-        # The zeros that each sighting alone would give; the search starts from their median.
+        # The zeros that each sighting alone would yield; the search starts from their median.
         a, b = jacobian[start + i, 0, 0], jacobian[start + i, 0, 1]
         c, d = jacobian[start + i, 1, 0], jacobian[start + i, 1, 1]
         determinant = a * d - b * c
@@ -57,7 +61,10 @@ def _segment(residual, jacobian, start, stop, shift):
 
 @njit(**OPTIONS)
 def partition(residual, jacobian, places, smallest):
-    """Best partition of sightings (n, 2) with cuts at ``places``; labels (n,), 0: common zeros."""
+    """Return labels (n,) of the best partition of sightings (n, 2), with cuts at ``places``.
+
+    Label 0 marks all sightings with the common zeros; the other labels count from 1.
+    """
     n, count = len(residual), len(places)
     plain = np.zeros(n + 1)
     for i in range(n):
@@ -73,7 +80,7 @@ def partition(residual, jacobian, places, smallest):
             cost = before + plain[stop] - plain[start]
             if cost < best[k]:
                 best[k], come[k], own[k] = cost, j, False
-            # Skip where own zeros would not pay even if they explained everything.
+            # Skip a segment whose own zeros would not pay even if they explained everything.
             if stop - start < FEWEST or before + PRICE >= best[k]:
                 continue
             if plain[stop] - plain[start] < PRICE:
@@ -95,7 +102,7 @@ def partition(residual, jacobian, places, smallest):
             for i in range(places[come[k]], places[k]):
                 label[i] = number
         k = come[k]
-    # Numbered from the first to the last.
+    # Number the regimes in order of time.
     for i in range(n):
         if label[i] > 0:
             label[i] = number + 1 - label[i]

@@ -1,4 +1,4 @@
-"""Compiled: one sighting updates the weighted hypotheses of a heliostat; see stream.py.
+"""Compiled kernels: one sighting updates a heliostat's weighted hypotheses; see stream.py.
 
 A state holds the P constants, the offsets of the Z zeros in the present regime, and the C
 Ornstein-Uhlenbeck processes. Each hypothesis is a Gaussian over this state: mean (S,), covariance
@@ -12,11 +12,11 @@ from numba import njit
 
 from heliotrope.jit import INNER, OPTIONS
 
-# What happened before a sighting; UNKNOWN weighs all of it.
+# What happened before a sighting; UNKNOWN weighs all the possibilities.
 UNKNOWN, NOTHING, STEP, REGIME, RETURN, BLUNDER = -1, 0, 1, 2, 3, 4
-#: Most hypotheses after a sighting, and the smallest weight of one.
+#: Maximum number of hypotheses after a sighting, and the minimum weight of a hypothesis.
 MOST, LEAST = 8, 1e-4
-#: Hypotheses whose means and standard deviations differ by less than this are one.
+#: Hypotheses whose means and standard deviations differ by less than this are merged.
 ALIKE = 0.3
 
 
@@ -35,7 +35,7 @@ def propagate(mean, covariance, first, amplitude, tau, days):
 
 @njit(**OPTIONS)
 def moments(weight, mean, covariance, first, amplitude, tau, days):
-    """Mean (S,) and covariance (S, S) of all hypotheses together after ``days``."""
+    """Return the mean (S,) and covariance (S, S) of all hypotheses combined, after ``days``."""
     count, size = mean.shape
     middle, spread = np.zeros(size), np.zeros((size, size))
     later, spreads = mean.copy(), covariance.copy()
@@ -52,7 +52,7 @@ def moments(weight, mean, covariance, first, amplitude, tau, days):
 
 @njit(**INNER)
 def reset(mean, covariance, k, variance):
-    """Forget component k of one hypothesis, in place."""
+    """Reset component k of one hypothesis to its prior ``variance``, in place."""
     mean[k] = 0.0
     for j in range(mean.shape[0]):
         covariance[k, j] = 0.0
@@ -71,8 +71,9 @@ def _log_density(x, y, a, b, c):
 def _compare(mean, covariance, rows, value, noise, far):
     """Compare one hypothesis with a sighting.
 
-    Returns the covariance of the state with it (S, 2), the gap, the gap's covariance, and the log
-    density of the gap, as it stands and with the variance ``far`` of a blunder.
+    The gap is the sighting minus its prediction. Returns the covariance of the state with the gap,
+    (S, 2), the gap, its covariance, and two log densities of the gap: for a good sighting, and for
+    a blunder with the variance ``far``.
     """
     size = mean.shape[0]
     gain = np.zeros((size, 2))
@@ -93,7 +94,7 @@ def _compare(mean, covariance, rows, value, noise, far):
 
 @njit(**INNER)
 def _condition(mean, covariance, gap):
-    """Update one hypothesis by the sighting that it was compared with, in place."""
+    """Update one hypothesis with the sighting that it was compared with, in place."""
     gain, x, y, a, b, c = (
         gap[0],
         gap[1],
@@ -166,7 +167,7 @@ def _total(values, count):
 
 @njit(**INNER)
 def _heaviest_first(weight, count):
-    """Indices of the weights in descending order; equal weights keep their order."""
+    """Return indices that sort weights in descending order; equal weights keep their order."""
     order = np.empty(count, dtype=np.int64)
     for k in range(count):
         j = k
@@ -179,9 +180,9 @@ def _heaviest_first(weight, count):
 
 @njit(**INNER)
 def _reduce(mean, covariance, weight, regime, count):
-    """Sort hypotheses by weight, merge similar and drop improbable ones; return their number.
+    """Sort hypotheses by weight, merge similar ones, drop improbable ones; return their number.
 
-    Their indices are in ``keep``.
+    The indices of the remaining hypotheses are returned in ``keep``.
     """
     order = _heaviest_first(weight, count)
     keep = np.empty(MOST, dtype=np.int64)
@@ -209,7 +210,9 @@ def update(
     weight, mean, covariance, regime, rows, value, noise, days, event,
     zeros, offsets, first, step, lost, amplitude, tau, chance, far
 ):  # fmt: skip
-    """Hypotheses (weight, mean, covariance, regime) after one more sighting, and its log density.
+    """Return a heliostat's hypotheses after one more sighting, and the sighting's log density.
+
+    A hypothesis is a weight, a mean, a covariance and a regime.
 
     ``rows`` (2, S) are the derivatives of the whitened values ``value`` (2,) with respect to the
     state; ``noise`` is (2, 2). ``zeros`` and ``offsets`` (Z,) are the positions of the zeros'

@@ -1,4 +1,4 @@
-"""How well a field was learnt, judged by the errors of the held-out sightings."""
+"""Assess how well a field was learnt, from the errors of the held-out sightings."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,15 +23,15 @@ from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.axis_accuracy import AxisAccuracy, axis_accuracy
 from heliotrope.mechanism.tracking import track
 
-#: Distance at which an aim point represents a direction, m.
+#: Distance of an aim point that represents a direction, m.
 FAR = 1e6
 #: Heliostats with fewer sightings are listed but do not enter the overall figures.
 ENOUGH = 20
-#: Share of unexplained sightings from which a heliostat is named, and share beyond which nothing
-#: agrees.
+#: A heliostat is named if at least this share of its sightings is unexplained; beyond the second
+#: share, nothing agrees.
 SHARE, NOTHING = 0.15, 0.6
-#: Maximum number of heliostats named per reason, and prior standard deviations from which a value
-#: is named.
+#: Maximum number of heliostats named per reason. A value is named if it is more than this many
+#: prior standard deviations from nominal.
 NAMED, STRAINED = 8, 10.0
 
 
@@ -71,7 +71,7 @@ class HeliostatFigures:
     steps: int
 
     def document(self) -> dict[str, Any]:
-        """Return the results for JSON, in mrad."""
+        """Return the results in mrad, as a JSON object."""
         figures: dict[str, Any] = {
             "n": self.count,
             "n_held_out": self.beam.count,
@@ -156,7 +156,7 @@ class Assessment(Framed):
         )
 
     def document(self) -> dict[str, Any]:
-        """Return the results for JSON, in mrad."""
+        """Return the results in mrad, as a JSON object."""
         return {
             "heliostats": {h.name: h.document() for h in self.heliostats},
             "median_of_medians_mrad": 1e3 * self.median_of_medians,
@@ -173,7 +173,7 @@ class Assessment(Framed):
         }
 
 
-#: Distance beyond which a Gaussian puts fewer than one sighting in a million, standard deviations.
+#: Fewer than one Gaussian sighting in a million lies beyond this many standard deviations.
 BLUNDER = 5.3
 
 
@@ -183,7 +183,7 @@ def assess(
     prediction: Prediction | None = None,
     tested: npt.NDArray[np.bool_] | None = None,
 ) -> Assessment:
-    """Return the errors of the sightings that were not used in learning.
+    """Return the errors of sightings that were not used in learning.
 
     Parameters
     ----------
@@ -274,9 +274,9 @@ def _axes(learned: Learned, values: FloatArray, sightings: Sightings) -> AxisAcc
     """Return the zeros before the fit and the scatter after it, from held-out sightings.
 
     Guo's γ', α' are drive angles. For the zeros, (44) and (46), they are the angles of the nominal
-    drives, so that the zero itself is found and not its remainder after the fit; for the scatter,
-    (45) and (47), those of the learnt drives. His γ, α, (43), are the angles at which the learnt
-    mechanism reflects the source to the observed destination.
+    drives, so that the zero itself is found and not what is left of it after the fit. For the
+    scatter, (45) and (47), they are the angles of the learnt drives. His γ, α, (43), are the angles
+    at which the learnt mechanism reflects the source to the observed destination.
     """
     learned_mirrors = moved_by(learned.mechanism, sightings.heliostat, learned.names, values)
     vertex = learned_mirrors.pose(sightings.counts).vertex
@@ -318,7 +318,7 @@ def unexplained_mirrors(names: tuple[str, ...], learned: Learned) -> tuple[str, 
     names
         Names of the N heliostats.
     learned
-        The sightings that were not used are not considered.
+        The learnt field; its unused sightings are not considered.
     """
     reasons: dict[str, list[str]] = {}
     for misfit in learned.misfits:
@@ -353,7 +353,7 @@ def unexplained_mirrors(names: tuple[str, ...], learned: Learned) -> tuple[str, 
 
 
 def _listed(names: list[str]) -> str:
-    """Return the first few names, and the number of remaining names."""
+    """Return the first few names, and how many more there are."""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return ", ".join(names[:NAMED]) + more
 

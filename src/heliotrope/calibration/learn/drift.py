@@ -5,11 +5,11 @@ The parameters of a heliostat at time t are
 $$ x_p(t) = μ_p + s_p + ρ_p[\text{regime}(t)] + \sum_c d_{pc}(t) $$
 
 where μ is the mean of the field, s the deviation of the heliostat (variance τ², learnt from the
-field), ρ an offset of the two zeros in each regime and after each step, and d Ornstein-Uhlenbeck
-processes: the zeros creep over months (*slow*) and optionally over *weeks*, and the mirror normal
-moves within *hours* (temperature, wind, direction of approach). The model is linear in x and
-Gaussian, so everything follows in closed form (Rasmussen & Williams 2006, Gaussian Processes for
-Machine Learning, (2.23)-(2.24), (5.8)-(5.12)).
+field), ρ an offset of the two drive zeros in each regime and after each step, and d
+Ornstein-Uhlenbeck processes: the drive zeros creep over months (*slow*) and optionally over
+*weeks*, and the mirror normal moves within *hours* (temperature, wind, direction of approach). The
+model is linear in x and Gaussian, so everything follows in closed form (Rasmussen & Williams 2006,
+Gaussian Processes for Machine Learning, (2.23)-(2.24), (5.8)-(5.12)).
 """
 
 from collections.abc import Sequence
@@ -29,26 +29,26 @@ from heliotrope.parallel import run_blocks
 DAY = 86400.0
 #: Names of the time scales of the processes.
 GROUPS = ("slow", "weeks", "hours")
-#: Starting values of the search, and the standard deviation of their logarithms.
+#: Starting values of the search, and the prior standard deviation of their logarithms.
 START_DAYS = {"slow": 300.0, "weeks": 5.0, "hours": 0.1}
 START_RAD = {"slow": 1e-3, "weeks": 1e-3, "hours": 2.5e-4}
 START_NOISE = 0.5
 STRAY = 0.7
-#: Standard deviation of one heliostat's own logarithms about the field's; half of this for time
+#: Standard deviation of one heliostat's logarithms about those of the field; half as much for time
 #: constants.
 OWN_STRAY = 0.4
-#: Minimum number of sightings for finding outliers.
+#: Minimum number of sightings needed to find outliers.
 FEWEST = 4
-#: Share of the heliostats from which the hyperparameters are learnt.
+#: Fraction of the heliostats from which the hyperparameters are learnt.
 TYPICAL = 0.85
-#: Factor on the table's prior if the fit needed a far start.
+#: The prior from the table is widened by this factor if the fit needed a far start.
 WIDE = 10.0
 #: Standard deviation of a zero after a re-reference or repair, rad.
 REGIME_RAD = 0.020
-#: Standard deviation of a step, rad: a jack that slipped, a limit switch that moved.
+#: Standard deviation of a step, rad, such as a slipped jack or a displaced limit switch.
 STEP_RAD = 0.001
-#: Gain in log evidence that a step needs beyond the logarithm of the number of positions tried, and
-#: the minimum number of sightings before and after it.
+#: Gain in log evidence that a step must bring, beyond the logarithm of the number of positions
+#: tried, and the minimum number of sightings before and after the step.
 STEP_GAIN, AFTER_STEP = 4.0, 3
 #: Minimum time between two sightings with a step between them, days.
 STEP_GAP = 1.0 / 24.0
@@ -76,8 +76,8 @@ def zeros(mechanism: Mechanism) -> tuple[str, ...]:
 def default_processes(mechanism: Mechanism) -> tuple[Process, ...]:
     """Return the usual processes of a kind of mechanism: creep of the zeros, motion of the normal.
 
-    A process over weeks is possible too; on the measurements of Jülich it improves nothing
-    beyond the steps.
+    A process over weeks is possible too, but for the Jülich measurements it adds nothing to what
+    the steps explain.
     """
     processes = [Process(name, "slow") for name in zeros(mechanism)]
     normal = [n for n in ("canting", "canting_secondary") if n in mechanism.parameters]
@@ -102,13 +102,13 @@ class Hyperparameters:
     step
         Standard deviation of a step of the zeros, (P,).
     wide
-        Standard deviation of a constant whose nominal value turned out to be wrong, (P,).
+        Standard deviation of the constant part if its nominal value turned out to be wrong, (P,).
     amplitude
         Standard deviation of each process, (C,).
     tau
         Time constants of the time scales in use, days, (G,).
     noise
-        Noise of a sighting, in units of the sighting's sigma.
+        Noise of a sighting, in units of its stated sigma.
     rate
         Steps per day.
     heavy
@@ -173,9 +173,9 @@ def start(
     model
         Constant parameters to be estimated.
     processes
-        Default: `default_processes`; ``()`` for none.
+        Drift processes; ``()`` for none. Default: `default_processes`.
     priors
-        Standard deviations of the model's parameters; default: the table's.
+        Standard deviations of the model's parameters. Default: those in the parameter table.
     """
     moving = default_processes(mechanism) if processes is None else processes
     extra = [p.parameter for p in moving] + list(zeros(mechanism))
@@ -208,22 +208,22 @@ class Linear:
     Attributes
     ----------
     jacobian
-        (n, 2, P), whitened.
+        Whitened derivatives J, (n, 2, P).
     value
-        y, to be explained by the parameters' deviations from ``centre``, (n, 2).
+        Values y, to be explained by the parameters' deviations from ``centre``, (n, 2).
     time
-        Days, (n,).
+        Time in days, (n,).
     regime
         (n,).
     centre
         Centre of the prior, (P,).
     own
-        Whether the centre is a far start, to which no population mean applies, (P,).
+        Whether the centre is a start far from nominal, to which no population mean applies, (P,).
     steps
-        Times of the steps of the zeros, days, ascending, (K,).
+        Times at which the zeros stepped, days, ascending, (K,).
     suspect
-        Whether a sighting is far from the robust fit, and so used only if the others agree with it,
-        (n,).
+        Whether a sighting is far from the robust fit, and is therefore used only if the other
+        sightings agree with it, (n,).
     """
 
     jacobian: FloatArray
@@ -249,14 +249,14 @@ class Linear:
         return len(self.time)
 
     def gap(self, time: FloatArray) -> FloatArray:
-        """Return the days from times (m,) to the nearest sighting; 0 where unknown."""
+        """Return the days from times (m,) to the nearest sighting; 0 for unknown times."""
         known = self.time[np.isfinite(self.time)]
         if not len(known):
             return np.zeros(len(time))
         return np.asarray(np.nan_to_num(np.abs(time[:, None] - known).min(axis=1), nan=0.0))
 
     def take(self, rows: npt.ArrayLike) -> "Linear":
-        """Return the sightings at some indices."""
+        """Return the sightings at given indices."""
         index = np.asarray(rows)
         return replace(
             self,
@@ -276,7 +276,7 @@ class Linear:
         return np.where(self.own, hyper.wide, hyper.spread)
 
     def rest(self, hyper: Hyperparameters) -> FloatArray:
-        """Value minus the part explained by the population mean, (n, 2)."""
+        """Value minus the part that the population mean explains, (n, 2)."""
         return np.ascontiguousarray(self.value - self.jacobian @ self.mean(hyper))
 
 
@@ -304,7 +304,7 @@ def _gram(hyper: Hyperparameters, a: Linear, b: Linear | None = None) -> FloatAr
 
 
 def covariance(hyper: Hyperparameters, data: Linear) -> FloatArray:
-    """Return the covariance of the values, noise included, (2 n, 2 n)."""
+    """Return the covariance of the values, including noise, (2 n, 2 n)."""
     return _gram(hyper, data) + hyper.noise**2 * np.eye(2 * len(data))
 
 
@@ -313,13 +313,13 @@ def fit_hyperparameters(
 ) -> tuple[Hyperparameters, float]:
     """Return the most probable noise, amplitudes and time constants, and the negative log evidence.
 
-    A weak prior of standard deviation ``STRAY`` around the logarithms of the start values holds the
-    values that the data do not determine.
+    A weak prior, with standard deviation ``STRAY`` about the logarithms of the starting values,
+    holds the values that the data do not determine.
 
     Parameters
     ----------
     hyper
-        Start of the search.
+        Starting values of the search.
     field
         Heliostats to learn from.
     iterations
@@ -332,10 +332,10 @@ def fit_hyperparameters(
 def typical(
     hyper: Hyperparameters, field: Sequence[Linear], share: float = TYPICAL
 ) -> list[Linear]:
-    """Return the ``share`` of heliostats that ``hyper`` explains best per sighting.
+    """Return the fraction ``share`` of the heliostats that ``hyper`` explains best per sighting.
 
-    The trimmed likelihood prevents one faulty heliostat from increasing the drift of the whole
-    field.
+    Leaving out the worst heliostats prevents one faulty heliostat from increasing the drift of the
+    whole field.
     """
     rows = [d for d in field if len(d)]
     if len(rows) < 4:
@@ -353,7 +353,10 @@ def start_vector(hyper: Hyperparameters) -> FloatArray:
 
 
 def refine(hyper: Hyperparameters, data: Linear, iterations: int = 30) -> Hyperparameters:
-    """Return one heliostat's own hyperparameters, close to the field's unless its data differ."""
+    """Return one heliostat's own hyperparameters.
+
+    They stay close to the field's unless the heliostat's data differ.
+    """
     spread = np.full(len(hyper.vector), OWN_STRAY)
     spread[1 + len(hyper.processes) :] = 0.5 * OWN_STRAY
     return _search(hyper, [data], hyper.vector, spread, iterations)[0]
@@ -421,9 +424,9 @@ def _search(
 def _no_less_than_nothing(covariances: FloatArray, before: FloatArray) -> FloatArray:
     """Remove negative eigenvalues caused by rounding from covariances (m, P, P).
 
-    Directions that the data determine almost exactly are differences of nearly equal numbers. In
-    units of the prior standard deviations (variances ``before``, (m, P)), no direction is assumed
-    to be known better than to 1e-6.
+    Where the data determine a direction almost exactly, its variance is the difference of nearly
+    equal numbers. In units of the prior standard deviations (variances ``before``, (m, P)), no
+    direction is assumed to be known better than to 1e-6.
     """
     scale = np.sqrt(before)
     both = scale[:, :, None] * scale[:, None, :]
@@ -454,11 +457,12 @@ class Posterior:
         Parameters
         ----------
         time
-            Days, (m,); NaN: at an unknown time.
+            Time in days, (m,); NaN if unknown.
         regime
             (m,).
         wander
-            Whether to include the drift processes; otherwise only the constant part and the regime.
+            Whether to include the drift processes; otherwise only the constant part and the regime
+            offset are included.
         """
         h, data = self.hyper, self.data
         m, size = len(time), len(h.names)
@@ -468,7 +472,7 @@ class Posterior:
         share = np.broadcast_to(constant, (m, len(data), size)).copy()
         epoch = data.epoch_at(time)
         if wander:
-            # Far from all sightings, steps may have occurred that no sighting shows.
+            # Long before or after all sightings, steps may have occurred that no sighting shows.
             own = own + (h.rate * data.gap(time))[:, None] * h.step**2
         own = own + epoch[:, None] * h.step**2
         share += np.minimum(epoch[:, None], data.epoch)[:, :, None] * h.step**2
@@ -489,11 +493,14 @@ class Posterior:
         return values, _no_less_than_nothing(covariances, own)
 
     def left_out(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return z² (n,), error (n, 2), covariance (n, 2, 2) of each sighting given the others."""
+        """Predict each sighting from the other sightings of the heliostat.
+
+        Returns z² (n,), the errors (n, 2) and their covariances (n, 2, 2).
+        """
         return left_out(self.inverse, self.alpha)
 
     def log_predictive(self) -> FloatArray:
-        """Return the log probability density of each sighting given the others, (n,)."""
+        """Return the log probability density of each sighting, given the other sightings, (n,)."""
         square, _, spread = self.left_out()
         half_log = 0.5 * np.log(np.linalg.det(spread)) if len(square) else np.empty(0)
         return np.asarray(-0.5 * square - half_log - np.log(2.0 * np.pi))
@@ -509,10 +516,10 @@ class Posterior:
 def find_outliers(
     hyper: Hyperparameters, data: Linear, alpha: float = ALPHA
 ) -> npt.NDArray[np.bool_]:
-    """Return the mask of outliers: suspects that the others contradict, then generalised ESD.
+    """Return a mask of outliers: suspects that the other sightings contradict, then ESD outliers.
 
-    The test alone would start from a fit that bad sightings have distorted; with a third of them
-    bad, it would remove good ones.
+    The generalised ESD test alone would start from a fit that bad sightings have distorted. If a
+    third of the sightings were bad, it would remove good ones.
     """
     mask = np.zeros(len(data), dtype=np.bool_)
     if len(data) < FEWEST:
@@ -542,9 +549,9 @@ def posterior(hyper: Hyperparameters, data: Linear) -> Posterior:
 
 
 def permissive(hyper: Hyperparameters) -> Hyperparameters:
-    """Return ``hyper`` with zeros that may move within days by as much as a step.
+    """Return ``hyper`` changed so that the zeros may move by as much as a step within days.
 
-    A sighting that is an outlier even then does not indicate a step.
+    A sighting that is an outlier even then is not evidence of a step.
     """
     moving = [n for n, size in zip(hyper.names, hyper.step, strict=True) if size > 0]
     if not moving or "weeks" in hyper.groups:
@@ -564,8 +571,8 @@ def permissive(hyper: Hyperparameters) -> Hyperparameters:
 def find_steps(hyper: Hyperparameters, data: Linear) -> FloatArray:
     """Return the times (days) of steps of the zeros that the evidence supports.
 
-    The best time is found in closed form, then the next given the first, and so on as long as the
-    log evidence increases enough.
+    The best time of one step is found in closed form, then that of the next step given the first,
+    and so on as long as the log evidence increases enough.
     """
     moving = np.flatnonzero(hyper.step > 0)
     order = np.argsort(data.time, kind="stable")
@@ -591,7 +598,10 @@ def find_steps(hyper: Hyperparameters, data: Linear) -> FloatArray:
 
 
 def step_rate(members: Sequence["Posterior"]) -> float:
-    """Return steps per day over the members' spans, with one more step in three years as prior."""
+    """Return the steps per day over the time that the members' sightings span.
+
+    The prior is one step in 1000 days.
+    """
     days, steps = 1000.0, 1.0
     for member in members:
         known = member.data.time[np.isfinite(member.data.time)]
@@ -601,28 +611,30 @@ def step_rate(members: Sequence["Posterior"]) -> float:
     return steps / days
 
 
-#: Weight of the table's priors in the population, as a number of heliostats.
+#: The table's priors count as this many heliostats in the population.
 TABLE_WORTH = 2.0
-#: Degrees of freedom of the population, so that one wrongly installed heliostat does not widen it.
+#: Degrees of freedom of the population's t distribution, so that one wrongly installed heliostat
+#: does not widen it.
 POPULATION_FREEDOM = 4.0
-#: Minimum number of heliostats from which a group is learnt; fewer say less than the priors in the
-#: table.
+#: Minimum number of heliostats from which a group is learnt; fewer heliostats say less than the
+#: priors in the table.
 TEACHERS = 4
 
 
 def fit_population(
     hyper: Hyperparameters, table: FloatArray, members: Sequence[Posterior]
 ) -> Hyperparameters:
-    """Return ``hyper`` with new mean and spread of the population (one step of EM).
+    """Return ``hyper`` with a new mean and spread of the population (one EM step).
 
-    Below `TEACHERS` heliostats the mean stays: one heliostat says little about the others.
+    With fewer than `TEACHERS` heliostats the mean is kept, because one heliostat says little about
+    the others.
 
     Parameters
     ----------
     hyper
-        Hyperparameters under which the members were computed.
+        Hyperparameters with which the members were computed.
     table
-        Standard deviations from the parameter table, (P,); 0 if a parameter only drifts.
+        Standard deviations from the parameter table, (P,); 0 for a parameter that only drifts.
     members
         Heliostats.
     """
@@ -653,9 +665,10 @@ def fit_population(
 
 
 def heavy_tails(members: Sequence[Posterior], outliers: int) -> float:
-    """Return the factor (at least 1) on the noise variance with which the ellipses cover 90 %.
+    """Return the factor (at least 1) on the noise variance that makes the ellipses cover 90 %.
 
-    The coverage is judged by left-out sightings; ``outliers`` further sightings count as outside.
+    Each sighting is predicted from the others to judge the coverage. In addition, ``outliers``
+    sightings count as outside their ellipses.
     """
     parts = [m.left_out() for m in members if len(m.data) > 3]
     if not parts:

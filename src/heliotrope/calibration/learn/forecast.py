@@ -27,14 +27,15 @@ class Forecast(Value, Framed):
     aim
         ENU metres, (3,).
     counts
-        Drive counts to which the heliostat is commanded, (T, D).
+        Commanded drive counts, (T, D).
     error
         Expected beam error to the right of and above the aim as seen from the mirror, rad, (T, 2).
     covariance
         Covariance of the error as a sighting would measure it: parameters, drift and noise, rad²,
         (T, 2, 2).
     reachable
-        Whether the sun is up and the aim within reach, (T,); where not, all other values are NaN.
+        Whether the sun is up and the aim within reach, (T,). Where it is false, all other values
+        are NaN.
     """
 
     heliostat: str
@@ -53,7 +54,7 @@ class Forecast(Value, Framed):
 
     @property
     def rms(self) -> FloatArray:
-        """Two-dimensional root mean square of the error including its uncertainty, rad, (T,)."""
+        """Two-dimensional root mean square of the error, including its uncertainty, rad, (T,)."""
         spread = np.trace(self.covariance, axis1=-2, axis2=-1)
         return np.asarray(np.sqrt(self.beam**2 + spread))
 

@@ -1,9 +1,8 @@
 """Hyperparameters of a heliostat group, learnt overnight from a running plant's photographs.
 
 The learning itself is step 3 of `learning`, as in ``heliotrope evaluate``. This module adds what an
-unattended plant needs: a limit on the sightings, so that the work fits into a night, and a check
-that the new values would have predicted the photographs better. The learnt values then enter the
-model of each heliostat (`applied`).
+unattended plant needs. It limits the number of sightings, so that the work can be done in one
+night, and checks that the new values would have predicted the photographs better.
 """
 
 from collections.abc import Sequence
@@ -23,9 +22,10 @@ from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.values import amount
 
-#: Most sightings of one mirror, whole visits spread over its history: the cost grows as their cube.
+#: Maximum number of sightings of one heliostat, in whole visits spread over its history. The cost
+#: grows as the cube of this number.
 MOST = 120
-#: Sightings further apart than this are of two visits, s.
+#: Sightings further apart than this belong to different visits, s.
 APART = 3600.0
 
 
@@ -38,12 +38,12 @@ class GroupHistory:
     mechanism
         Nominal mechanisms of the N heliostats, (N,).
     sightings
-        Photographs of each heliostat, as sightings of heliostat 0; None if there are none; N in
-        total.
+        One entry for each of the N heliostats: its photographs, as sightings of heliostat 0, or
+        None if it has none.
     model
         The constant parameters.
     before
-        Hyperparameters in force.
+        Current hyperparameters.
     """
 
     mechanism: Mechanism
@@ -54,7 +54,10 @@ class GroupHistory:
 
 @dataclass(frozen=True)
 class GroupTask:
-    """Data from which a group is learnt: M sightings of K of its heliostats; see `GroupHistory`."""
+    """Data from which a group is learnt: M sightings of K of its heliostats.
+
+    The attributes are those of `GroupHistory`.
+    """
 
     mechanism: Mechanism
     sightings: Sightings
@@ -69,12 +72,12 @@ class LearntGroup:
     Attributes
     ----------
     hyper
-        Its hyperparameters.
+        Hyperparameters of the group.
     heliostats, sightings
         Number of heliostats and of sightings from which they were learnt.
     gain
-        How much better they predict a sighting from the earlier ones than the previous
-        hyperparameters did: mean difference of the log probability density.
+        How much better the new hyperparameters predict a sighting from earlier sightings than the
+        previous hyperparameters did: the mean gain in log probability density.
     """
 
     hyper: Hyperparameters
@@ -84,12 +87,12 @@ class LearntGroup:
 
 
 def defaults(mechanism: Mechanism, model: tuple[str, ...]) -> Hyperparameters:
-    """Return the hyperparameters that apply before anything is learnt."""
+    """Return the hyperparameters that apply until a group has been learnt."""
     return replace(drift.start(mechanism, model), rate=drift.step_rate(()))
 
 
 def able(histories: Sequence[Sightings | None]) -> npt.NDArray[np.intp]:
-    """Return the heliostats with enough sightings to learn from, on at least two days."""
+    """Return the indices of heliostats with enough sightings to learn from, on two days or more."""
     rows = []
     for row, sightings in enumerate(histories):
         known = np.zeros(0) if sightings is None else sightings.time[np.isfinite(sightings.time)]
@@ -99,7 +102,7 @@ def able(histories: Sequence[Sightings | None]) -> npt.NDArray[np.intp]:
 
 
 def gathered(group: GroupHistory) -> GroupTask:
-    """Return the task of learning a group.
+    """Return the data from which to learn a group.
 
     Raises
     ------
@@ -122,10 +125,10 @@ def gathered(group: GroupHistory) -> GroupTask:
 
 
 def thinned(sightings: Sightings, most: int = MOST) -> Sightings:
-    """Return some of a heliostat's sightings in order of time: whole visits, with the last one.
+    """Return at most ``most`` sightings of a heliostat, as whole visits in order of time.
 
-    Visits are kept whole to show motion within hours, and spread over the years to show motion
-    within months.
+    The latest visit is always included. Visits are kept whole so that they show motion over hours,
+    and are spread over the whole history so that they show motion over months.
     """
     order = np.flatnonzero(np.isfinite(sightings.time))
     sightings = sightings.take(order[np.argsort(sightings.time[order], kind="stable")])
@@ -139,7 +142,7 @@ def thinned(sightings: Sightings, most: int = MOST) -> Sightings:
 
 
 def learn_group(task: GroupTask) -> LearntGroup:
-    """Return the hyperparameters of a group from its sightings, and their gain."""
+    """Return the hyperparameters learnt from a group's sightings, and the gain they bring."""
     every = np.ones(len(task.sightings), np.bool_)
     with threadpool_limits(1, "blas"):
         hyper = learning.field_of(
@@ -152,7 +155,7 @@ def learn_group(task: GroupTask) -> LearntGroup:
 
 
 def density(task: GroupTask, fitted: FieldFit, hyper: Hyperparameters) -> float:
-    """Return the log density of all sightings, each predicted from the earlier ones."""
+    """Return the log density of all sightings, each predicted from the earlier sightings."""
     total = 0.0
     for row in range(len(task.mechanism)):
         if int(fitted.outcome[row]) == FitOutcome.CONVERGED:
@@ -185,7 +188,7 @@ _ARRAYS = ("mean", "spread", "regime", "step", "wide", "amplitude", "tau")
 
 
 def document_of(hyper: Hyperparameters) -> dict[str, Any]:
-    """Return hyperparameters as a record for JSON."""
+    """Return hyperparameters as a JSON object."""
     return {
         "names": list(hyper.names),
         "processes": [[p.parameter, p.group] for p in hyper.processes],

@@ -34,7 +34,7 @@ from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.sun import Site, Times, unix_seconds
 from heliotrope.values import Card, Value, amount, dots, span
 
-#: Default standard deviation of a sighting of a heliostat without sightings, rad of beam.
+#: Default standard deviation of a sighting for a heliostat without sightings, rad of beam.
 USUAL_SIGMA = 5e-4
 
 
@@ -45,11 +45,11 @@ class Prediction(Value, Framed):
     Attributes
     ----------
     errors
-        Angle between the predicted and the measured beam, (M,).
+        Angle between the predicted and the measured beam, rad, (M,).
     plane
         Predicted minus measured, rad of beam to the right of and above the destination, (M, 2).
     covariance
-        Predicted covariance of ``plane``: parameters, drift and noise, rad², (M, 2, 2).
+        Predicted covariance of ``plane``, due to parameters, drift and noise, rad², (M, 2, 2).
     inside
         Whether the error lies within the 90 % ellipse, (M,).
     beam
@@ -107,7 +107,7 @@ class Learned(Value, Framed):
     mechanism
         Nominal mechanisms, (N,).
     sightings
-        All sightings given.
+        All M sightings.
     model
         Names of the constant parameters.
     used
@@ -123,10 +123,11 @@ class Learned(Value, Framed):
     outlier
         Mask of the outliers among the sightings used, (M,).
     unusable
-        Mask of the sightings that no parameters near the fit can produce, (M,); they are left out.
+        Mask of the sightings that no parameters near the fit can produce, (M,). These sightings are
+        not used.
     rows
-        For each heliostat the indices of its sightings, outliers included, in the order of its
-        member.
+        For each heliostat, the indices of its sightings, including outliers, in the order in which
+        its entry in ``members`` holds them.
     heliostats
         Names, (N,); () if unknown.
     around
@@ -151,7 +152,7 @@ class Learned(Value, Framed):
     misfits: tuple[Misfit, ...] = ()
 
     def row(self, heliostat: int | str) -> int:
-        """Return the index of a heliostat, by name or by index.
+        """Return the index of a heliostat, given by name or by index.
 
         Raises
         ------
@@ -170,7 +171,7 @@ class Learned(Value, Framed):
         return heliostat
 
     def __getitem__(self, heliostat: int | str) -> "Learned":
-        """Return one heliostat of the field, by name or index."""
+        """Return one heliostat of the field, given by name or index."""
         i = self.row(heliostat)
         mine = np.flatnonzero(self.sightings.heliostat == i)
         place = np.full(len(self.sightings), -1)
@@ -191,7 +192,7 @@ class Learned(Value, Framed):
         )
 
     def doubted(self) -> "Learned":
-        """Return the result marked for a doubtful clock: no heliostat counts as learnt."""
+        """Return the result for a doubtful clock, in which no heliostat counts as learnt."""
         outcome = self.static.outcome.copy()
         outcome[np.isin(outcome, (FitOutcome.CONVERGED, FitOutcome.NOT_CONVERGED))] = (
             FitOutcome.CLOCK
@@ -232,15 +233,16 @@ class Learned(Value, Framed):
         heliostat
             Name or index.
         times
-            T times, see `heliotrope.sun.Times`; a pandas index is accepted.
+            T times; see `heliotrope.sun.Times`. A pandas index is accepted.
         target
-            Name of a target of the plant learnt from, a target or receiver, or a point (m), (3,).
+            Name of a target of the plant that was learnt, a target or receiver, or a point, m,
+            (3,).
         site
-            Site, if the field was learnt from mechanisms alone.
+            Site; required if the field was learnt from mechanisms alone.
         steered
-            The mechanism that the controller assumes for the heliostat, batch shape (); default: as
-            learnt, at the time of its last sighting used. The nominal mechanism yields the error
-            before calibration.
+            The mechanism that the controller assumes for the heliostat, batch shape (). Default:
+            the learnt mechanism at the time of the heliostat's last used sighting. Pass the nominal
+            mechanism to forecast the error before calibration.
         sigma
             Standard deviation of a sighting's ray, rad of beam; default: the median over this
             heliostat's sightings.
@@ -291,14 +293,14 @@ class Learned(Value, Framed):
         return regime_at(self.sightings.time[rows], self.regime[rows], when)
 
     def parameters_at(self, heliostat: npt.ArrayLike, time: Times) -> tuple[FloatArray, FloatArray]:
-        """Return deviations (M, P) at Unix times (M,) and their covariance (M, P, P).
+        """Return deviations (M, P) at Unix times (M,), and their covariance (M, P, P).
 
         Parameters
         ----------
         heliostat
             Indices of the heliostats, (M,).
         time
-            See `heliotrope.sun.Times`, () or (M,); NaN: at an unknown time.
+            See `heliotrope.sun.Times`, () or (M,); NaN if unknown.
 
         Raises
         ------
@@ -321,20 +323,20 @@ class Learned(Value, Framed):
             order = np.argsort(rows, kind="stable")
             heliostats, first = np.unique(rows[order], return_index=True)
             for i, part in zip(heliostats, np.split(order, first)[1:], strict=True):
-                # In parts, because memory grows with sightings × times × parameters.
+                # Computed in parts, because memory grows with sightings × times × parameters.
                 for some in np.array_split(part, 1 + len(part) // 500):
                     label = self.regimes(int(i), when[some])
                     values[some], spread[some] = self.members[i].at(when[some] / DAY, label)
         return values, spread
 
     def mechanism_at(self, heliostat: npt.ArrayLike, time: Times) -> Mechanism:
-        """Return the mechanisms expected of ``heliostat`` (M,) at ``time`` (M,)."""
+        """Return the expected mechanisms of the heliostats ``heliostat`` (M,) at ``time`` (M,)."""
         values, _ = self.parameters_at(heliostat, time)
         return moved_by(self.mechanism, heliostat, self.names, values)
 
 
 def predict(learned: Learned, sightings: Sightings) -> Prediction:
-    """Return the predicted beams of sightings compared with the measured beams.
+    """Return the predicted beams of sightings, compared with the measured beams.
 
     Parameters
     ----------
@@ -352,12 +354,12 @@ def predict(learned: Learned, sightings: Sightings) -> Prediction:
 def predict_with(
     learned: Learned, sightings: Sightings, values: FloatArray, spread: FloatArray
 ) -> Prediction:
-    """Return the predicted beams of sightings (M,) under given parameters.
+    """Predict the beams of sightings (M,) with given parameters.
 
     Parameters
     ----------
     learned
-        Learnt field of N heliostats, of which the nominal mechanisms and the noise are used.
+        Learnt field of N heliostats; only its nominal mechanisms and noise are used.
     sightings
         M sightings of these heliostats.
     values, spread
@@ -380,9 +382,9 @@ def predict_with(
 
 
 def squared_distance(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return squared lengths (M,) of errors (M, 2) in units of covariances (M, 2, 2); may be NaN.
+    """Return squared lengths (M,) of errors (M, 2) in units of their covariances (M, 2, 2).
 
-    Computed in closed form, because a matrix of NaN has no inverse.
+    The inverse is in closed form, so that a covariance of NaN yields NaN rather than an error.
     """
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     x, y = error[:, 0], error[:, 1]
@@ -392,16 +394,16 @@ def squared_distance(error: FloatArray, covariance: FloatArray) -> FloatArray:
 def moved_by(
     mechanism: Mechanism, heliostat: npt.ArrayLike, names: tuple[str, ...], values: FloatArray
 ) -> Mechanism:
-    """Mechanisms of rows ``heliostat`` (M,) with deviations ``values`` (M, P)."""
+    """Return the mechanisms of heliostats ``heliostat`` (M,) with deviations ``values`` (M, P)."""
     nominal = mechanism[np.asarray(heliostat, dtype=np.intp)]
     return nominal.with_parameters({n: values[:, p] for p, n in enumerate(names)})
 
 
 def left_out_errors(learned: Learned) -> FloatArray:
-    """Return each beam error, predicted from the heliostat's other sightings, (M, 2).
+    """Return the error of each beam, predicted from the heliostat's other sightings, (M, 2).
 
-    Predicted minus measured, rad to the right of and above the destination. Outliers and unused
-    sightings are predicted from all sightings that were used.
+    The error is predicted minus measured, to the right of and above the destination, in rad.
+    Outliers and unused sightings are predicted from all sightings that were used.
     """
     known = predict(learned, learned.sightings)
     errors = known.plane.copy()

@@ -1,10 +1,10 @@
-"""Learning a field: from sightings to parameters that predict, with their uncertainty.
+"""Learn a field: estimate, from sightings, parameters that predict beams with an uncertainty.
 
-1. A robust maximum a posteriori fit of each heliostat (`fit.estimator`).
-2. Regimes in time (`regimes`), and a second fit on the regime with the common zeros.
-3. From a sample of the field: the population of the parameters, their drift and the noise
-   (`drift`), without the outliers (`outliers`).
-4. For each heliostat the posterior given its own sightings, under these hyperparameters.
+1. Fit each heliostat robustly, maximum a posteriori (`fit.estimator`).
+2. Find regimes in time (`regimes`), and fit again the regime with the common zeros.
+3. From a sample of the field, find the population of the parameters, their drift and the noise
+  (`drift`), leaving out the outliers (`outliers`).
+4. Compute the posterior of each heliostat given its own sightings and these hyperparameters.
 
 Steps 1, 2 and 4 treat every heliostat independently; only step 3 needs several heliostats.
 """
@@ -39,7 +39,7 @@ from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.parallel import threads
 
-#: Minimum number of sightings of a heliostat from which hyperparameters are learnt.
+#: Hyperparameters are learnt only from heliostats with at least this many sightings.
 FEWEST = 8
 #: Maximum number of heliostats from which the hyperparameters are learnt.
 SAMPLE = 60
@@ -47,13 +47,13 @@ SAMPLE = 60
 MISTAKE = 5.0
 #: Residuals of the robust fit longer than this, in units of its scale, are suspect.
 SUSPECT = 8.0
-#: Number of repeated linearisations; on the Jülich data a second one changes nothing.
+#: Number of repeated linearisations; on the Jülich data a second repetition changes nothing.
 LINEARISED = 1
 #: Maximum number of repetitions of the regime search and the fit on the common regime.
 TURNS = 4
-#: Ratio of the residuals of a model to their repeatability within a day.
+#: Factor between the repeatability of residuals within a day and the residuals of a good model.
 REPEATS = 3.0
-#: Rounds of expectation and maximisation over the population.
+#: Number of expectation-maximisation rounds over the population.
 ROUNDS = 6
 
 Progress = Callable[[int, int], None]
@@ -93,7 +93,7 @@ def prepare(
         static = fit(mechanism, sightings, model, keep=used, priors=priors, loss=loss)
     for turn in range(TURNS):
         moved = mechanism.with_parameters(static.parameters)
-        # Regimes shift a pair of zeros; a mechanism with one drive has none.
+        # Regimes shift a pair of zeros, so a mechanism with one drive has no regimes.
         if len(zeros) != 2:
             break
         new = regime.copy()
@@ -114,7 +114,7 @@ def prepare(
     at = np.zeros((len(mechanism), len(names)))
     centre = np.zeros_like(at)
     at[:, : len(model)], centre[:, : len(model)] = static.values, static.centre
-    # A start near the nominal only helped the search; the prior stays centred on the nominal.
+    # A start near nominal only helped the search, so the prior stays centred on nominal.
     centre[(np.abs(static.centre) < MISTAKE * static.prior).all(axis=1)] = 0.0
     field, rows = [], []
     for i in range(len(mechanism)):
@@ -138,7 +138,10 @@ def prepare(
 
 
 def _without_unusable(prepared: Prepared, usable: npt.NDArray[np.bool_]) -> Prepared:
-    """Leave out unusable sightings; ``usable`` is in the order of all heliostats' sightings."""
+    """Leave out unusable sightings.
+
+    ``usable`` is ordered heliostat by heliostat, as the prepared sightings are.
+    """
     if usable.all():
         return prepared
     regime, unusable = prepared.regime.copy(), prepared.unusable.copy()
@@ -160,8 +163,9 @@ def relinearise(
 ) -> Prepared:
     """Relinearise each sighting about its heliostat's posterior at that time.
 
-    A Gauss-Newton step on the whole history: the robust fit may lie far from the posterior with
-    population, regimes and drift, and the law of a jack is not linear.
+    This is a Gauss-Newton step on the whole history. It is needed because the robust fit may lie
+    far from the posterior that accounts for population, regimes and drift, and because a jack is
+    not linear.
     """
     names = members[0].hyper.names
     rows = np.concatenate(prepared.rows)
@@ -182,15 +186,15 @@ def relinearise(
         jacobian = np.ascontiguousarray(line.jacobian[part])
         value = np.einsum("nap,np->na", jacobian, values[part] - d.centre) - line.residual[part]
         field.append(replace(d, jacobian=jacobian, value=value))
-    # Parameters that no mechanism can have are extrapolations from uninformative sightings.
+    # Parameters that no mechanism can have were extrapolated from uninformative sightings.
     return _without_unusable(replace(prepared, field=tuple(field)), is_usable(line) & ~lost)
 
 
 def repeatability(time: FloatArray, residual: FloatArray) -> float:
     """Return `REPEATS` times the repeatability of residuals within a day; inf if unknown.
 
-    With mixed regimes the scale of all residuals is meaningless, but consecutive sightings still
-    show the noise.
+    When regimes are mixed, the scale of all residuals is meaningless, but differences between
+    consecutive sightings still show the noise.
     """
     order = np.argsort(time, kind="stable")
     order = order[np.isfinite(time[order])]
@@ -198,14 +202,15 @@ def repeatability(time: FloatArray, residual: FloatArray) -> float:
     if near.sum() < FEWEST:
         return float("inf")
     steps = np.linalg.norm(np.diff(residual[order], axis=0)[near], axis=1)
-    # The length of a difference of two residuals is Rayleigh with √2 σ; its median 1.1774 √2 σ.
+    # The length of the difference of two residuals is Rayleigh distributed with √2 σ, so its median
+    # is 1.1774 √2 σ.
     return float(REPEATS * np.median(steps) / (1.1774 * np.sqrt(2.0)))
 
 
 def _by_heliostat(
     s: Sightings, used: npt.NDArray[np.bool_], count: int
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Offsets (N + 1,) and used sightings by heliostat, in an order independent of the input."""
+    """Return where each heliostat's used sightings begin, (N + 1,), and their order."""
     order = canonical_order(s)
     order = order[used[order]]
     return np.searchsorted(s.heliostat[order], np.arange(count + 1)), order
@@ -251,7 +256,7 @@ def finish(
 ) -> tuple[Posterior, npt.NDArray[np.bool_]]:
     """Return one heliostat's posterior under the field's ``hyper``, and a mask of its outliers.
 
-    With ``own`` its noise and drift may differ from the field's.
+    If ``own`` is true, the heliostat's noise and drift may differ from those of the field.
     """
     if len(data) >= FEWEST and hyper.processes:
         outlier = drift.find_outliers(drift.permissive(hyper), data)
@@ -287,8 +292,9 @@ def learn(
     Parameters
     ----------
     mechanism
-        The heliostats: their nominal mechanisms, (N,) or (); or ``plant[name]``, a group, or a
-        plant of one kind, whose nominal mechanisms are used. The last three also supply names.
+        Nominal mechanisms of the heliostats, (N,) or (); or ``plant[name]``, a group, or a plant of
+        one kind of heliostat, whose nominal mechanisms are then used. The last three also supply
+        names.
     sightings
         M sightings of these heliostats, in any order.
     model
@@ -304,7 +310,7 @@ def learn(
     loss
         Loss function of the robust fit.
     own
-        Whether each heliostat's noise and drift may differ from the field's.
+        Whether each heliostat's noise and drift may differ from those of the field.
     rounds
         Number of expectation-maximisation rounds over the population.
     misfits
@@ -352,7 +358,7 @@ class Task:
     own: bool = True
 
     def of(self, rows: npt.NDArray[np.intp], count: int) -> "Task":
-        """Return the task of some heliostats, with their part of the priors."""
+        """Return the task for some of the heliostats, with the priors for these heliostats."""
         cut = {
             n: as_float(v)[rows] if as_float(v).shape == (count,) else v
             for n, v in self.priors.items()
@@ -362,14 +368,15 @@ class Task:
 
 @dataclass(frozen=True)
 class Part:
-    """Result for some heliostats; indices refer to their own sightings."""
+    """Result for some heliostats; its indices count only the sightings of these heliostats."""
 
     prepared: Prepared
     members: tuple[Posterior, ...]
     outlier: npt.NDArray[np.bool_]
 
 
-#: Function that learns a list of (mechanism, sightings, used, task, hyper), here or elsewhere.
+#: Function that learns a list of (mechanism, sightings, used, task, hyper), in this process or
+#: elsewhere.
 Runner = Callable[
     [
         list[tuple[Mechanism, Sightings, npt.NDArray[np.bool_], Task, Hyperparameters]],
@@ -387,7 +394,7 @@ def learn_part(
     hyper: Hyperparameters,
     progress: Progress | None = None,
 ) -> Part:
-    """Learn some heliostats under the field's ``hyper``: steps 1, 2 and 4."""
+    """Learn some heliostats, given the field's ``hyper``: steps 1, 2 and 4."""
     with threadpool_limits(1, "blas"):
         prepared = prepare(
             mechanism, sightings, task.model, hyper.names, used, priors=task.priors, loss=task.loss
@@ -406,7 +413,11 @@ def _cut(
     task: Task,
     rows: npt.NDArray[np.intp],
 ) -> tuple[Mechanism, Sightings, npt.NDArray[np.bool_], Task, npt.NDArray[np.intp]]:
-    """Select heliostats ``rows`` of a field, renumbered, and the indices of their sightings."""
+    """Select the heliostats ``rows`` of a field, with their sightings and options.
+
+    Returns the mechanisms, the sightings with heliostat indices from 0, the mask of used sightings,
+    the task, and the indices of the sightings in the field.
+    """
     place = np.full(len(mechanism), -1)
     place[rows] = np.arange(len(rows))
     mine = np.flatnonzero(place[sightings.heliostat] >= 0)
@@ -481,7 +492,7 @@ def field_of(
     processes: tuple[drift.Process, ...] | None = None,
     rounds: int = ROUNDS,
 ) -> Hyperparameters:
-    """Return the hyperparameters of a field from at most ``SAMPLE`` of its heliostats."""
+    """Return the hyperparameters of a field, learnt from at most ``SAMPLE`` of its heliostats."""
     counts = np.bincount(sightings.heliostat[used], minlength=len(mechanism))
     able = np.flatnonzero(counts >= FEWEST)
     if len(able) > SAMPLE:
@@ -499,7 +510,7 @@ def field_of(
 def _prior_row(
     model: tuple[str, ...], mechanism: Mechanism, priors: Mapping[str, npt.ArrayLike] | None
 ) -> FloatArray:
-    """One standard deviation per parameter: the median if heliostats have their own."""
+    """Return one prior standard deviation per parameter: the median over the heliostats."""
     table = [as_float((priors or {}).get(n, mechanism.parameter(n).prior)) for n in model]
     return np.array([np.median(t) for t in table], dtype=np.float64)
 

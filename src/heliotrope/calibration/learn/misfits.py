@@ -1,11 +1,11 @@
-"""Heliostats that do not fit their sightings, with the likely reason.
+"""Find heliostats that do not fit their sightings, with the likely reason.
 
-If a motor is connected in reverse, or sightings are assigned to the wrong heliostat, the sightings
-fit no parameters, or only absurd ones. Each likely mistake is a hypothesis: the sightings are
+If a motor is connected in reverse, or sightings are assigned to the wrong heliostat, no parameters
+fit the sightings, or only absurd ones. Each likely mistake is a hypothesis: the sightings are
 reinterpreted as if the mistake had been made, and fitted in the usual way. A hypothesis that
-explains the sightings far better is reported as the reason. Such a heliostat is not learnt, and
-does not influence the field. Mirrored or rotated photographs are a camera mistake, which is tested
-over all heliostats together.
+explains the sightings far better is reported as the reason. A heliostat with such a reason is not
+learnt, and does not influence the field. Mirrored or rotated photographs are a camera mistake,
+which is tested over all heliostats together.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,37 +28,40 @@ from heliotrope.mechanism.drives import SLOTS, Drive
 from heliotrope.mechanism.tracking import track
 from heliotrope.values import amount
 
-#: Parameters are doubtful above this sum of squares, in standard deviations of their priors.
+#: Parameters are doubtful if the sum of their squares, in units of their prior standard deviations,
+#: exceeds this.
 DOUBTFUL = 25.0
-#: Beam error beyond which a sighting that the others contradict shows a different beam, rad.
+#: If the other sightings contradict a sighting by more than this beam error, rad, it shows a
+#: different beam.
 ELSEWHERE = 5e-3
-#: No change during the life of a heliostat explains a median beam error beyond this, rad.
+#: A median beam error above this, rad, cannot be explained by any change that a heliostat undergoes
+#: in its life.
 HOPELESS = 50e-3
-#: A mistake is reported if its hypothesis lowers the cost by more than this, and to less than this
-#: share.
+#: A mistake is reported if its hypothesis lowers the cost by more than the first number, and to
+#: less than the second number times the original cost.
 GAIN, SHARE = 30.0, 0.5
-#: The beam errors under the hypothesis are at most this many times the errors without it.
+#: The beam errors under the hypothesis may be at most this many times the errors without it.
 ALIKE = 1.5
-#: Fewer sightings than this leave the priors in force: they give no reason for `DOUBTFUL` values.
+#: With fewer sightings than this, the values follow the priors and cannot become `DOUBTFUL`.
 WITNESSES = 3
 #: A heliostat stood still if its normal turned by less than the first angle, rad, while the
 #: bisector of its rays turned by more than the second.
 STILL, TURNED = 1e-3, 10e-3
-#: Number of sightings with which a hypothesis is tested, and number of other heliostats that are
-#: tried.
+#: Maximum number of sightings with which a hypothesis is tested, and number of other heliostats
+#: that are tried.
 MOST, OTHERS = 40, 4
-#: Number of sightings by which the other heliostats are chosen.
+#: Number of sightings used to choose the other heliostats.
 FEW = 5
 #: Counts are scaled if the drives require a factor that differs from 1 by more than this; the fit
 #: then refines the factor with this prior standard deviation.
 SCALED, LOOSE = 0.02, 0.05
-#: Sightings scatter if half of them are further than this many sigmas from the position that the
-#: others predict; no fit is valid if the distance also exceeds this angle, rad. The worst of 18
-#: real heliostats has 1.6 and 1.0 mrad.
+#: Sightings are inconsistent if half of them are further than this many sigmas from the position
+#: that the other sightings predict. If the distance also exceeds this angle, rad, no fit is valid.
+#: The worst of 18 real heliostats has 1.6 sigmas and 1.0 mrad.
 SCATTERED, APART = 4.0, 2e-3
-#: Number of heliostats by which photographs are judged: those with the most sightings.
+#: Number of heliostats, those with the most sightings, that are used to judge the photographs.
 MIRRORS = 10
-#: Mistakes of photographs: text, and the signs of right and up on the target.
+#: Possible mistakes in photographs: text, and the signs of right and up on the target.
 PHOTOGRAPHS = (
     ("mirrored left to right", (-1.0, 1.0)),
     ("mirrored top to bottom", (1.0, -1.0)),
@@ -100,7 +103,7 @@ def find_misfits(
     sightings
         M sightings of these heliostats; their names appear in the reasons.
     used
-        Mask of the sightings to judge by, (M,).
+        Mask of the sightings to use, (M,).
     targets
         Targets of the plant; without them the check for mirrored photographs is skipped.
     """
@@ -137,15 +140,15 @@ def find_misfits(
 
 
 def scattered(row: int, white: FloatArray, sigma: FloatArray) -> Misfit | None:
-    """Return the misfit of a heliostat whose sightings are inconsistent; None if they agree.
+    """Return the misfit of a heliostat if its sightings are inconsistent; None if they agree.
 
     Parameters
     ----------
     row
-        Row of the heliostat.
+        Index of the heliostat.
     white
-        Distance of each sighting from the position that the others predict, in units of its sigma,
-        (n,).
+        Distance of each sighting from the position that the other sightings predict, in units of
+        its sigma, (n,).
     sigma
         Standard deviations of the sightings, rad of beam, (n,).
     """
@@ -162,7 +165,7 @@ def scattered(row: int, white: FloatArray, sigma: FloatArray) -> Misfit | None:
 
 
 def costs(fitted: FieldFit, mechanism: Mechanism) -> FloatArray:
-    """Return the robust cost of each heliostat's sightings and parameters, far starts included."""
+    """Return the robust cost of each heliostat's sightings and parameters, including far starts."""
     square = (fitted.lengths * fitted.scale[fitted.rows] / CAUCHY_WIDTH) ** 2
     data = np.bincount(
         fitted.rows, CAUCHY_WIDTH**2 * np.log1p(np.nan_to_num(square)), len(mechanism)
@@ -184,7 +187,7 @@ def _is_better(cost: float, unchanged: float) -> bool:
 def _of_photographs(
     mechanism: Mechanism, sightings: Sightings, names: tuple[str, ...], targets: Sequence[Target]
 ) -> Iterator[Misfit]:
-    """Yield all heliostats with a beam on a target if their photographs are mirrored or rotated."""
+    """Yield every heliostat with a beam on a target, if its photographs are mirrored or rotated."""
     on = [
         target.holds(sightings.destination) & ~sightings.destination_at_infinity
         for target in targets
@@ -205,7 +208,7 @@ def _of_photographs(
         return costs(fitted, machines), _median_errors(machines, other, fitted)
 
     unchanged, error = read((1.0, 1.0))
-    # A heliostat that fits in no orientation says nothing about the photographs of the others.
+    # A heliostat that fits in no orientation says nothing about photographs of other heliostats.
     good = np.isfinite(unchanged)
     trials = {text: read(sign) for text, sign in PHOTOGRAPHS}
     best = min(trials, key=lambda text: float(trials[text][0][good].sum()))
@@ -237,7 +240,7 @@ def _reflected(
 
 
 def _some(sightings: Sightings, most: int) -> Sightings:
-    """Return at most ``most`` sightings, spread evenly over all."""
+    """Return at most ``most`` sightings, spread evenly over all sightings."""
     places = np.linspace(0, len(sightings) - 1, min(most, len(sightings))).round().astype(np.intp)
     return sightings.take(np.unique(places))
 
@@ -257,7 +260,7 @@ def _unmoved(mechanism: Mechanism, sightings: Sightings) -> Iterator[Misfit]:
 
 
 def _span(directions: FloatArray) -> float:
-    """Return the largest angle from the first of some directions, rad."""
+    """Return the largest angle between the first direction and any other direction, rad."""
     return float(angle_between(directions, directions[:1]).max(initial=0.0))
 
 
@@ -272,7 +275,10 @@ def _median_errors(mechanism: Mechanism, sightings: Sightings, fitted: FieldFit)
 def _hopeless(
     mechanism: Mechanism, mine: Sightings, outcome: FitOutcome, strain: float, error: float
 ) -> str | None:
-    """Return the reason why a fit cannot be valid even if no sighting is wrong; None if it can."""
+    """Return the reason why a fit cannot be valid, even if no sighting is wrong.
+
+    Returns None if the fit can be valid.
+    """
     still = [
         mechanism.joints[joint]
         for d, joint in enumerate(mechanism.driven)
@@ -296,7 +302,7 @@ def _hopeless(
 
 
 def _mistake(mechanism: Mechanism, mine: Sightings, row: int, names: tuple[str, ...]) -> str | None:
-    """Return the mistake that explains the sightings of a heliostat, None if there is none."""
+    """Return the mistake that explains the sightings of a heliostat; None if there is none."""
     part = _some(mine, MOST)
     trials = [*_hypotheses(mechanism, part, row), *_scaled(mechanism, part, row)]
     machines = mechanism[np.array([trial.row for trial in trials])]
@@ -308,9 +314,9 @@ def _mistake(mechanism: Mechanism, mine: Sightings, row: int, names: tuple[str, 
     }
     fitted = fit(machines, sightings, names, priors=priors, adapt_scale=False)
     error, trial_costs = _median_errors(machines, sightings, fitted), costs(fitted, machines)
-    # The first trial uses the original sightings. A true mistake explains them no worse: a zero
-    # that is far off strains the priors too, but leaves smaller errors than a swapped heliostat
-    # does.
+    # The first trial uses the original sightings. A true mistake explains them no worse than the
+    # original fit does: a drive zero that is far off also strains the priors, but leaves smaller
+    # errors than a swapped heliostat does.
     least = 2.0 * float(np.median(part.sigma))
     enough = np.clip(np.nan_to_num(ALIKE * error[0], nan=np.inf), least, ELSEWHERE)
     trial_costs = np.where(error <= enough, trial_costs, np.inf)
@@ -337,12 +343,12 @@ class _Trial:
     text
         A clause for display.
     row
-        Row of the mechanism.
+        Index of the mechanism.
     sightings
         The sightings with the mistake undone.
     factors
-        Factors of the counts by the parameters that refine them, whose prior is wide; ``text`` has
-        a placeholder for them.
+        Factors of the counts, keyed by the parameters that refine them. These parameters have a
+        wide prior. ``text`` has a placeholder for the factors.
     """
 
     text: str
@@ -352,7 +358,7 @@ class _Trial:
 
 
 def _scaled(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Trial]:
-    """Yield the count factors that the nominal drives would need to match the rays."""
+    """Yield trials with the counts scaled as the nominal drives need to match the rays."""
     if len(mechanism.driven) != 2 or len(part) < FEW:
         return
     mirror = mechanism[row]
@@ -386,7 +392,7 @@ def _scaled(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Trial]
 
 
 def _factor(drive: Drive, counts: FloatArray, angles: FloatArray) -> float:
-    """Return the factor that makes the counts match the angles; 1 if there is none."""
+    """Return the factor that makes the counts match the angles; 1 if no factor does."""
     order = np.argsort(counts, kind="stable")
     expected, recorded = drive.counts(np.unwrap(angles[order])), counts[order]
     half = len(order) // 2
@@ -443,7 +449,7 @@ def _hypotheses(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Tr
 
 
 def _reversed(mechanism: Mechanism, part: Sightings, row: int, drive: int) -> FloatArray:
-    """Return the counts of a reversed drive: reflected about 0, or within its range for a jack."""
+    """Return the counts of a reversed drive: negated, or mirrored within the range of a jack."""
     table = mechanism.drives.table[row, drive]
     ends = table[[SLOTS["min_count"], SLOTS["max_count"]]]
     about = ends.sum() if np.isfinite(ends).all() else 0.0
@@ -451,7 +457,7 @@ def _reversed(mechanism: Mechanism, part: Sightings, row: int, drive: int) -> Fl
 
 
 def _likely(mechanism: Mechanism, part: Sightings, row: int) -> list[int]:
-    """Return the other heliostats that would fit these sightings best."""
+    """Return the indices of the other heliostats that would fit these sightings best."""
     some = _some(part, FEW)
     count = len(some)
     every = np.repeat(np.arange(len(mechanism)), count)

@@ -1,4 +1,4 @@
-"""Chooses the parameters that a field needs, by predictive score, and reports the evidence.
+"""Choose the parameters that a field needs, by predictive score, and report the evidence.
 
 Every candidate is learnt on a sample of the field. Its score is the mean log probability density of
 each sighting given the heliostat's other sightings (leave-one-out cross-validation in closed form:
@@ -25,11 +25,12 @@ from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS
 
-#: Models are compared on this many heliostats, those with the most sightings.
+#: Models are compared on this many heliostats: those with the most sightings.
 HELIOSTATS = 16
-#: A larger model must gain more than this in mean log density, about one per cent.
+#: A larger model must gain more than this in mean log density, that is, about one per cent.
 WORTH = 0.01
-#: Lowest log density that counts for one sighting, so that outliers do not choose the model.
+#: The log density of one sighting counts as at least this, so that outliers do not decide the
+#: choice of model.
 WORST = -25.0
 
 
@@ -42,10 +43,10 @@ class ScoredModel:
     name, parameters
         Name of the model, and names of its parameters.
     log_predictive
-        Mean log probability density of a sighting given the others.
+        Mean log probability density of a sighting given the heliostat's other sightings.
     behind, behind_error
-        Difference between ``log_predictive`` and that of the best candidate, and its standard
-        error.
+        Difference between ``log_predictive`` and that of the best candidate, and the standard error
+        of this difference.
     log_evidence
         Log evidence of all sightings under the learnt hyperparameters.
     """
@@ -58,7 +59,7 @@ class ScoredModel:
     log_evidence: float
 
     def document(self) -> dict[str, float]:
-        """Return the score for JSON."""
+        """Return the score as a JSON object."""
         return {
             "parameters": len(self.parameters),
             "log_predictive": self.log_predictive,
@@ -105,7 +106,7 @@ def _extras(mechanism: Mechanism) -> list[tuple[str, tuple[str, ...]]]:
 
 
 def _worms(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
-    """Return the periodic error's parameters by joint, for each drive whose ratio is known."""
+    """Return the parameters of the periodic error of each drive whose ratio is known, by joint."""
     ratio = mechanism.drives.table[..., SLOTS["worm_ratio"]].reshape(-1, len(mechanism.driven))
     joints = [mechanism.joints[k] for k in mechanism.driven]
     return {
@@ -128,12 +129,12 @@ def compare_models(
     Parameters
     ----------
     mechanism
-        Heliostats as for `learn`.
+        Heliostats, as for `learn`.
     sightings
         M sightings of these heliostats.
     models
-        By name, each the name of a model or the names of parameters; default: `candidate_models`,
-        the simplest first.
+        Candidates by name. Each is the name of a model or the names of its parameters. Default:
+        `candidate_models`, the simplest first.
     used
         Mask of the sightings to learn from, (M,).
     progress
@@ -185,13 +186,13 @@ def compare_models(
 
 
 def choose_model(scored: tuple[ScoredModel, ...]) -> ScoredModel:
-    """Return the simplest candidate within one standard error of the best, or within ``WORTH``."""
+    """Return the simplest candidate within one standard error, or within ``WORTH``, of the best."""
     able = [c for c in scored if c.behind <= max(c.behind_error, WORTH)]
     return min(able, key=lambda c: len(c.parameters))
 
 
 def describe(scored: tuple[ScoredModel, ...]) -> tuple[str, ...]:
-    """Return one line on the comparison of models; no line if there was none."""
+    """Return one line on the comparison of models; no lines if there was none."""
     if not scored:
         return ()
     listed = ", ".join(f"{c.name} {c.behind:.3f}±{c.behind_error:.3f}" for c in scored)
@@ -200,7 +201,7 @@ def describe(scored: tuple[ScoredModel, ...]) -> tuple[str, ...]:
 
 
 def _scores(learned: Learned) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Log predictive density of each sighting, and the mask of outliers."""
+    """Return the log predictive density of each sighting, and the mask of outliers."""
     score = np.full(len(learned.sightings), WORST)
     for i, member in enumerate(learned.members):
         rows = learned.rows[i][~learned.outlier[learned.rows[i]]]

@@ -1,4 +1,4 @@
-"""Learns chunks of heliostats on several computers with dask.distributed."""
+"""Learn chunks of heliostats on several computers with dask.distributed."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -10,13 +10,13 @@ if TYPE_CHECKING:
 
 
 def connect(scheduler: str) -> "Client":
-    """Return a client of ``scheduler``.
+    """Return a client connected to ``scheduler``.
 
     Parameters
     ----------
     scheduler
         Address of a scheduler such as ``tcp://10.0.0.1:8786``, or ``local`` or ``local:N``
-        for N processes on this machine.
+        for N processes on this computer.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def connect(scheduler: str) -> "Client":
 
 
 def runner(client: "Client") -> Runner:
-    """Return a runner that learns chunks on the workers of ``client``, all at once."""
+    """Return a runner that learns chunks on the workers of ``client``, all at the same time."""
 
     def run(tasks: list[Any], progress: Progress | None) -> list[Part]:
         from distributed import as_completed

@@ -1,9 +1,10 @@
-"""Outliers by the generalised extreme Studentized deviate test (Rosner 1983, Technometrics 25).
+"""Find outliers with the generalised extreme Studentized deviate test.
 
-The sighting farthest from the prediction of the others is removed repeatedly; every sighting
-removed up to and including the last one that was farther than chance allows is an outlier. Two
-similar outliers therefore cannot hide each other. The squared distance in two components is χ² with
-two degrees of freedom: the largest of n exceeds 2 ln(n / α) with probability α.
+The test is that of Rosner (1983, Technometrics 25). The sighting farthest from the prediction of
+the others is removed repeatedly. The outliers are all sightings removed up to and including the
+last one that was farther away than chance allows. Two similar outliers therefore cannot hide each
+other. The squared distance in two components is χ² with two degrees of freedom, so the largest of n
+exceeds 2 ln(n / α) with probability α.
 """
 
 import numpy as np
@@ -14,7 +15,7 @@ from heliotrope.geometry import FloatArray
 
 #: Probability of a false outlier among the sightings of a heliostat.
 ALPHA = 1e-3
-#: Largest share of outliers.
+#: Largest fraction of the sightings that may be outliers.
 SHARE = 0.25
 
 
@@ -30,18 +31,18 @@ def generalised_esd(
     Parameters
     ----------
     residual
-        (n, 2), with expectation zero.
+        Residuals with expectation zero, (n, 2).
     covariance
-        Joint covariance, noise included, (2 n, 2 n).
+        Joint covariance of the residuals, including noise, (2 n, 2 n).
     alpha
         Probability of a false outlier in the whole set.
     share
-        Largest share of outliers.
+        Largest fraction of the residuals that may be outliers.
 
     Raises
     ------
     InputError
-        If alpha or share does not lie between 0 and 1, or the covariance is singular.
+        If ``alpha`` or ``share`` is not between 0 and 1, or the covariance is singular.
     """
     for name, value in (("alpha", alpha), ("share", share)):
         if not 0.0 < value < 1.0:
@@ -64,7 +65,7 @@ def generalised_esd(
 
 
 def left_out(inverse: FloatArray, alpha: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return each sighting's distance from the prediction of all others, and its variance.
+    """Return each sighting's distance from the prediction of all other sightings.
 
     ``inverse`` is K⁻¹ (2 n, 2 n), ``alpha`` K⁻¹ r (2 n,). Returns (z² (n,), error (n, 2),
     covariance (n, 2, 2)); z² is χ² with two degrees of freedom. (Rasmussen & Williams,
@@ -82,7 +83,10 @@ def left_out(inverse: FloatArray, alpha: FloatArray) -> tuple[FloatArray, FloatA
 def _remove_farthest(
     inverse: FloatArray, residual: FloatArray, most: int
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
-    """Remove the sighting farthest from the others ``most`` times: (which, their z²), in order."""
+    """Remove the sighting that is farthest from the remaining sightings, ``most`` times.
+
+    Returns the indices of the removed sightings and their z², in the order of removal.
+    """
     inverse, flat = inverse.copy(), residual.ravel().copy()
     which, squares = np.empty(most, dtype=np.intp), np.empty(most)
     removed = np.zeros(len(residual), dtype=np.bool_)
@@ -91,7 +95,7 @@ def _remove_farthest(
         best = int(np.argmax(np.where(removed, -np.inf, square)))
         which[step], squares[step] = best, square[best]
         removed[best] = True
-        # Schur: the inverse without rows and columns of ``best``.
+        # Schur complement: the inverse without the rows and columns of ``best``.
         rows = slice(2 * best, 2 * best + 2)
         pair = inverse[:, rows].copy()
         inverse -= pair @ spread[best] @ pair.T

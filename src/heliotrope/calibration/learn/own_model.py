@@ -1,8 +1,8 @@
-"""Chooses the model of one heliostat from its own sightings, in a fraction of a second.
+"""Choose the model of one heliostat from its own sightings, in a fraction of a second.
 
-`models` compares candidates over a field, including drift and population, which is minutes of work
-for a report. A running plant calibrates one heliostat at a time and has to continue. Here each
-candidate is one robust fit; its score is the log probability density of each calibration visit
+`models` compares candidates over a field, including drift and population, which takes minutes and
+suits a report. A running plant calibrates one heliostat at a time and cannot wait that long. Here
+each candidate is one robust fit. Its score is the log probability density of each calibration visit
 given the others, under its priors and white noise (Rasmussen & Williams 2006, (5.10)-(5.12), for
 blocks of two). As in `models`, the simplest candidate within one standard error of the best is
 chosen.
@@ -23,15 +23,15 @@ from heliotrope.geometry import FloatArray
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
 
-#: Fewest visits for a comparison.
+#: Minimum number of visits for a comparison.
 FEWEST = 8
-#: Only the latest visits are compared, because older visits cost time and describe an older state
-#: of the mechanism.
+#: Number of latest visits that are compared. Older visits cost time and describe an older state of
+#: the mechanism.
 MOST = 60
-#: Sightings that constants are fitted to and models are chosen by, the last ones: work that
-#: does not grow with the age of the plant.
+#: Number of latest sightings used to fit constants and choose models, so that the work does not
+#: grow with the age of the plant.
 RECENT = 1000
-#: Trial sizes of the noise of a visit, in units of the scale of the fit.
+#: Trial values of the noise of a visit, in units of the scale of the fit.
 NOISES = np.geomspace(0.2, 2.0, 9)
 
 
@@ -52,7 +52,7 @@ class OwnModel:
     name, parameters
         Name of the model, and names of the parameters to fit.
     errors
-        Periodic errors of initially unknown ratio that were found and belong to the model.
+        Periodic errors that belong to the model; their ratios were found by a search.
     """
 
     name: str
@@ -62,10 +62,11 @@ class OwnModel:
     def fitting(
         self, nominal: Mechanism, sightings: Sightings, group: Hyperparameters | None = None
     ) -> tuple[FieldFit, FieldFit]:
-        """Return the fit of constants, and the fit that follows the drift of its ``group``.
+        """Return a fit of constants, and a fit that follows the drift learnt from its ``group``.
 
-        The constants are fitted to the `latest` sightings; see `present`. The values are deviations
-        from ``nominal``, (1,), and include the ratios, so that they fully define the mechanism.
+        The constants are fitted to the `latest` sightings, and `present` describes the second fit.
+        The values are deviations from ``nominal``, (1,), and include the ratios, so that they fully
+        define the mechanism.
         """
         some = latest(sightings)
         constants = self.completed(fit(self.start(nominal), some, self.parameters))
@@ -79,7 +80,7 @@ class OwnModel:
         group: Hyperparameters | None,
         flown: Sequence[Flown] = (),
     ) -> FieldFit:
-        """Return the fit that follows the drift, alongside a fit of constants; see `present`."""
+        """Return a fit that follows the drift, starting from a fit of constants; see `present`."""
         fitted = fitting_present(
             self.start(nominal), sightings, self._searched(constants), group, flown
         )
@@ -130,13 +131,13 @@ def choose_own_model(nominal: Mechanism, sightings: Sightings, simple: str) -> O
     """Return the simplest model that explains the sightings of one heliostat.
 
     The candidates are those of `models.candidate_models`, including periodic errors whose ratio is
-    searched for, each combined with the parameters of the simple model. With fewer than `FEWEST`
-    visits the simple model is returned.
+    searched for, each combined with the parameters of the simple model. If there are fewer than
+    `FEWEST` visits, the simple model is returned.
 
     Parameters
     ----------
     nominal
-        Batch shape (1,).
+        Nominal mechanism, batch shape (1,).
     sightings
         M sightings of this heliostat, at index 0.
     simple
@@ -181,7 +182,7 @@ def _scored(
 def _left_out(
     mechanism: Mechanism, s: Sightings, names: tuple[str, ...], mean: FloatArray
 ) -> FloatArray:
-    """Log density of each visit given the others, (V,), at the noise that maximises it."""
+    """Return the log density of each visit, given the other visits, (V,), at the best noise."""
     fitted = fit(mechanism, s, names)
     moved = mechanism.with_parameters(fitted.parameters)
     line = linearise(moved[s.heliostat], s, names)

@@ -1,12 +1,12 @@
-r"""Searches the residuals for a periodic error of unknown ratio, or a harmonic of a known ratio.
+r"""Search residuals for a periodic error of unknown ratio, or for a harmonic of a known ratio.
 
 An eccentric worm or gear adds A cos(r x − δ) to its joint angle, where x is the ideal angle of the
 drive (the stroke of a jack) and r the unknown ratio (Malan, thesis, (6.1), knew the ratio: 30). For
 each trial r a cosine and a sine are added to the model, linearised about a robust fit. The
 constants may vary within their priors, because the residuals are whitened by the noise and the
-priors together. For one heliostat whose constants leave ν degrees of freedom, with normal noise of
-unknown size, the probability that the remaining fraction q of the sum of squares is as small by
-chance is
+priors together. Consider one heliostat whose constants leave ν degrees of freedom, with normal
+noise of unknown size. The probability that the remaining fraction of the sum of squares is as small
+as q by chance is
 
 $$ P(q) = q^{(ν-2)/2} $$
 
@@ -17,8 +17,9 @@ times that of one trial (Bonferroni). Residuals of real heliostats are not white
 peak is measured relative to the surrounding spectrum.
 
 Once a wave is found, its ratio and σ come from fits that include the wave. The first fit counted
-the wave as noise; noise that is assumed too large makes the constants stiff and biases the ratio. A
-constant that the fit moved further than its prior may vary here by the same amount.
+the wave as noise, and an assumed noise that is too large makes the constants stiff and biases the
+ratio. If the fit moved a constant further than its prior, the constant may vary here by the same
+amount.
 """
 
 from dataclasses import dataclass, replace
@@ -40,22 +41,24 @@ from heliotrope.mechanism.kernels import slots as slot
 
 #: A peak with a larger false-alarm probability than this is rejected.
 LEVEL = 1e-3
-#: A second peak this close in −ln P leaves the ratio open: it is one hundredth as probable.
+#: A second peak this close in −ln P leaves the ratio ambiguous: it is still one hundredth as
+#: probable as the first.
 RIVAL = float(np.log(100.0))
-#: Fewest degrees of freedom that the constants must leave.
+#: Minimum number of degrees of freedom that the constants must leave.
 FREEDOM = 10
 #: The constants may vary within this many times their priors.
 WIDER = 3.0
-#: Fewest turns of the worm within the range of a drive; slower waves look like constants.
+#: Minimum number of worm turns within the range of a drive; slower waves look like constants.
 FEWEST_TURNS = 1.5
-#: The peak is compared with the spectrum this many of its widths around, once it is taken out.
+#: The peak is compared with the spectrum within this many peak widths of it, after the peak has
+#: been removed.
 AROUND = 5.0
-#: Trials in the width of a peak.
+#: Number of trial ratios within the width of a peak.
 OVERSAMPLING = 6
-#: Photographs this close together, s, are one visit: their errors are alike.
+#: Photographs taken within this time, s, are one visit, because their errors are alike.
 VISIT = 300.0
-#: Harmonics of a known ratio: a bore off centre errs once in a turn of the worm, an oval worm twice
-#: (Malan, thesis, 6.4), one with three lobes three times.
+#: Harmonics of a known ratio. An off-centre bore causes an error with one period per turn of the
+#: worm, an oval worm two periods (Malan, thesis, 6.4), and a worm with three lobes three.
 HARMONICS = np.array([1.0, 2.0, 3.0])
 #: Number of fits that include the wave of a ratio that was found, each starting from the previous
 #: ratio.
@@ -79,7 +82,7 @@ class PeriodicError:
     amplitude, phase
         A and δ of each heliostat, rad, (N,); NaN for heliostats with too few sightings.
     false_alarm
-        Upper bound on the probability that chance produces so high a peak anywhere in the search.
+        Upper bound on the probability that chance produces such a high peak anywhere in the search.
     clear
         Whether no other ratio explains the sightings nearly as well.
     known
@@ -107,7 +110,7 @@ class PeriodicError:
         return f"{self.ratio:g}, {self.ratio / self.known:.0f} times the known {self.known:g}"
 
     def document(self) -> dict[str, Any]:
-        """Return the error for JSON."""
+        """Return the error as a JSON object."""
         return {
             "joint": self.joint,
             "ratio": self.ratio,
@@ -138,16 +141,16 @@ class _Member:
     Attributes
     ----------
     row
-        Row of the heliostat.
+        Index of the heliostat.
     x, lever
-        Argument of the wave (V, D) and derivative of the residual with respect to the angle, (V, 2,
-        D).
+        Argument of the wave, (V, D), and derivative of the residual with respect to the joint
+        angle, (V, 2, D).
     whiten
         Matrix that whitens the noise and removes the contribution of the constants, (2 V, 2 V).
     rest
         Whitened residuals, (2 V,).
     freedom
-        Degrees of freedom that the constants leave.
+        Number of degrees of freedom that the constants leave.
     """
 
     row: int
@@ -158,18 +161,18 @@ class _Member:
     freedom: int
 
     def waves(self, drive: int, ratios: FloatArray) -> FloatArray:
-        """Whitened cosine and sine of trial ratios (T,), (T, 2 V, 2)."""
+        """Return the whitened cosine and sine, (T, 2 V, 2), of trial ratios (T,)."""
         u = ratios[:, None] * self.x[:, drive]
         both = np.stack([np.cos(u), np.sin(u)], axis=-1)
         raw = (both[:, :, None, :] * self.lever[:, :, drive, None]).reshape(len(u), -1, 2)
         return np.asarray(self.whiten @ raw)
 
     def solved(self, drive: int, ratios: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coefficients of cosine and sine (T, 2), and −ln P of the trials, (T,)."""
+        """Return the cosine and sine coefficients (T, 2) and −ln P (T,) of trial ratios (T,)."""
         waves = self.waves(drive, ratios)
         normal = np.swapaxes(waves, 1, 2) @ waves
         right = np.swapaxes(waves, 1, 2) @ self.rest
-        # A wave that the constants can imitate has almost nothing left, and gains nothing.
+        # If the constants can imitate a wave, almost nothing is left of it, and it gains nothing.
         size = np.trace(normal, axis1=1, axis2=2)
         normal = normal + (1e-9 * size + 1e-30)[:, None, None] * np.eye(2)
         coefficients = np.linalg.solve(normal, right[..., None])[..., 0]
@@ -183,12 +186,12 @@ def search_periodic_errors(
 ) -> tuple[PeriodicError, ...]:
     """Return the best periodic error of each drive whose ratio is unknown, most significant first.
 
-    Each is returned with its probability of arising by chance; use only errors that are
-    `PeriodicError.found`. The search runs from `FEWEST_TURNS` to as many periods within the range
-    of the drive as there are calibration visits, because more periods than visits cannot be
-    distinguished from fewer. For a drive whose ratio is known only the `HARMONICS` are tried, and
-    an error is returned only if one of the harmonics is found. The result is empty if there are too
-    few sightings.
+    Each error is returned with its probability of arising by chance; use an error only if its
+    `PeriodicError.found` is true. The search covers waves with at least `FEWEST_TURNS` periods
+    within the range of the drive, and at most as many periods as there are calibration visits. With
+    more periods than visits, a wave could not be distinguished from a slower wave. For a drive
+    whose ratio is known only the `HARMONICS` are tried, and an error is returned only if one of the
+    harmonics is found. The result is empty if there are too few sightings.
 
     Parameters
     ----------
@@ -212,7 +215,7 @@ def search_periodic_errors(
 
 
 def with_ratios(mechanism: Mechanism, errors: tuple[PeriodicError, ...]) -> Mechanism:
-    """Return the mechanism with the ratios of the errors that are found."""
+    """Return the mechanism with the ratios of those errors that are significant."""
     for error in errors:
         if error.found:
             shift = {f"{error.joint}_worm_ratio": error.ratio - error.known}
@@ -225,7 +228,7 @@ def _joint(mechanism: Mechanism, drive: int) -> str:
 
 
 def _known_ratios(mechanism: Mechanism) -> dict[int, float]:
-    """Ratio of each drive that may have a periodic error, 0 if unknown.
+    """Return the ratio of each drive that may have a periodic error; 0 if the ratio is unknown.
 
     Drives whose heliostats have different ratios are skipped, because an error has a single ratio.
     """
@@ -238,7 +241,7 @@ def _known_ratios(mechanism: Mechanism) -> dict[int, float]:
 
 
 def arguments(drives: Drive, counts: FloatArray) -> FloatArray:
-    """Return x of each drive at its counts: ideal angle in rad, or stroke of a jack in m."""
+    """Return x for each drive: the ideal angle, rad, or the stroke of a jack, m."""
     t = drives.table
     moved = t[..., slot.RATE] * counts
     return np.asarray(np.where(t[..., slot.KIND] == slot.LINEAR, moved, t[..., slot.ZERO] + moved))
@@ -247,10 +250,10 @@ def arguments(drives: Drive, counts: FloatArray) -> FloatArray:
 def _members(
     mechanism: Mechanism, s: Sightings, worms: tuple[str, ...] = (), out: int = 0
 ) -> list[_Member]:
-    """Heliostats with enough visits after a robust fit of all constants and of known worms.
+    """Return the heliostats with enough visits after a robust fit of all constants and known worms.
 
-    The last ``out`` of the ``worms`` are fitted, so that the noise excludes them, but they are not
-    projected out with the constants.
+    The last ``out`` entries of ``worms`` are also fitted, so that they do not count as noise, but
+    they are not projected out as the constants are.
     """
     names = (*parameter_table.model("full", mechanism.parameters), *worms)
     fitted = fit(mechanism, s, names)
@@ -268,7 +271,7 @@ def _members(
         mean = _visit_means(s.time[mine], x[mine])
         slope = np.einsum("vm,map->vap", mean, line.jacobian[mine])
         at = fitted.values[row] - fitted.centre[row]
-        # Errors of installation beyond the priors would bias a ratio, but hardly hide one.
+        # Installation errors beyond the priors would bias a ratio, but would hardly hide it.
         far = np.maximum(fitted.prior[row], np.abs(at) if out else 0.0)
         residual = mean @ line.residual[mine] - slope[..., : len(names)] @ at
         member = _Member(
@@ -289,7 +292,10 @@ def _members(
 def _whitened(
     residual: FloatArray, constants: FloatArray, prior: FloatArray
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Whitening matrix, whitened residuals at the centre of the priors, degrees of freedom."""
+    """Return the whitening matrix, the whitened residuals, and the number of degrees of freedom.
+
+    The residuals are those at the centre of the priors.
+    """
     moved = constants * prior
     spread = np.eye(len(residual)) + moved @ moved.T
     whiten = np.linalg.inv(np.linalg.cholesky(spread))
@@ -297,16 +303,20 @@ def _whitened(
 
 
 def visit_means(mechanism: Mechanism, s: Sightings) -> FloatArray:
-    """Return the matrix that averages M sightings of heliostat row 0 over visits, (V, M)."""
+    """Return the matrix (V, M) that averages M sightings of heliostat 0 over visits."""
     return _visit_means(s.time, arguments(Drive(mechanism.drives.table[s.heliostat]), s.counts))
 
 
 def _visit_means(time: FloatArray, x: FloatArray) -> FloatArray:
-    """Matrix that averages m sightings over V visits, (V, m): close in time and in angle."""
+    """Return the matrix (V, m) that averages m sightings over V visits.
+
+    The sightings of a visit are close in time and in angle.
+    """
     if not len(time):
         return np.zeros((0, 0))
     order = np.argsort(time, kind="stable")
-    # The fastest trial turns once for each visit: an eighth of that turn is one place.
+    # The fastest trial wave has one period per visit; angles within an eighth of a period count as
+    # one position.
     near = np.ptp(x, axis=0) / (8.0 * len(x))
     visit = np.empty(len(time), np.intp)
     first, number = int(order[0]), -1
@@ -322,7 +332,7 @@ def _visit_means(time: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def _without(member: _Member, drive: int, ratio: float) -> _Member:
-    """Project a wave that was found out of the residuals, as for the constants."""
+    """Project a found wave out of the residuals, in the same way as the constants."""
     basis, _ = np.linalg.qr(member.waves(drive, np.array([ratio]))[0])
     out = np.eye(len(basis)) - basis @ basis.T
     return replace(
@@ -331,7 +341,7 @@ def _without(member: _Member, drive: int, ratio: float) -> _Member:
 
 
 def _grid(members: list[_Member], drive: int) -> tuple[FloatArray, float]:
-    """Trial ratios (T,) of a drive of unknown ratio, and the width of a peak."""
+    """Return trial ratios (T,) for a drive of unknown ratio, and the width of a peak."""
     span = float(max(np.ptp(m.x[:, drive]) for m in members))
     visits = float(np.median([len(m.x) for m in members]))
     if span <= 0.0 or visits < FEWEST_TURNS:
@@ -342,14 +352,14 @@ def _grid(members: list[_Member], drive: int) -> tuple[FloatArray, float]:
 
 
 def _power(members: list[_Member], drive: int, ratios: FloatArray) -> FloatArray:
-    """−ln P of trial ratios, summed over the heliostats, (T,)."""
+    """Return −ln P of trial ratios, summed over the heliostats, (T,)."""
     return as_float(np.sum([m.solved(drive, ratios)[1] for m in members], axis=0))
 
 
 def _peak(
     members: list[_Member], drive: int, near: float, step: float
 ) -> tuple[float, float, float]:
-    """Ratio of the highest −ln P within a step of ``near``, its height, and the ratio's σ."""
+    """Return the ratio of the highest −ln P within a step of ``near``, its height, and its σ."""
 
     def lost(ratio: float) -> float:
         return -float(_power(members, drive, np.array([ratio]))[0])
@@ -367,7 +377,7 @@ def _peak(
 def _strongest(
     mechanism: Mechanism, s: Sightings, drives: dict[int, float], taken: tuple[PeriodicError, ...]
 ) -> tuple[int, PeriodicError] | None:
-    """The drive with the highest peak, and its error; ``taken`` waves are projected out."""
+    """Return the drive with the highest peak, and its error; project out the waves in ``taken``."""
     members = _members(with_ratios(mechanism, taken), s, _worms(taken))
     spectra: dict[int, tuple[FloatArray, FloatArray, float]] = {}
     grids = {k: _grid(members, k) for k in drives} if members else {}
@@ -387,7 +397,7 @@ def _strongest(
     sigma, slow, near = 0.0, False, 0.0
     if not known:
         ratio, height, sigma = _peak(members, drive, ratio, step)
-        # Power that grows up to the first trial belongs to slower waves: no peak.
+        # Power that rises towards the slowest trial belongs to slower waves, so it is no peak.
         slow, near = ratio <= ratios[0] + 0.5 * step, width
     others = [
         spectrum[1][np.abs(spectrum[0] - ratio) > near] if k == drive else spectrum[1]
@@ -407,15 +417,15 @@ def _strongest(
         known=known,
     )
     for _ in range(REFINEMENTS if error.found else 0):
-        # The fit that found the wave counted it as noise; noise that is too large makes the
-        # constants stiff, which biases the ratio.
+        # The fit that found the wave counted it as noise. An assumed noise that is too large makes
+        # the constants stiff, which biases the ratio.
         errors = (*taken, error)
         members = _members(with_ratios(mechanism, errors), s, _worms(errors), out=2)
         if not known:
             ratio, _, sigma = _peak(members, drive, error.ratio, step)
             error = replace(error, ratio=ratio, sigma=sigma * float(np.sqrt(colour)))
     for m in members:
-        # The residual is model minus measurement: the error has the opposite sign.
+        # The residual is model minus measurement, so the error has the opposite sign.
         cosine, sine = -m.solved(drive, np.array([error.ratio]))[0][0]
         error.amplitude[m.row], error.phase[m.row] = (
             np.hypot(cosine, sine),
@@ -425,17 +435,17 @@ def _strongest(
 
 
 def _worms(errors: tuple[PeriodicError, ...]) -> tuple[str, ...]:
-    """Parameters of the waves that are found."""
+    """Return the parameters of the significant waves."""
     return tuple(f"{e.joint}_worm_{part}" for e in errors if e.found for part in ("cos", "sin"))
 
 
 def _colour(
     members: list[_Member], drive: int, ratio: float, ratios: FloatArray, width: float
 ) -> float:
-    """Ratio of the spectrum around a peak, without the peak, to white noise; at least 1.
+    """Return the ratio of the spectrum around a peak, without the peak, to white noise; at least 1.
 
-    The residuals of a real heliostat are not white noise but a broad hump of slow waves: at Jülich
-    twice as high as noise up to about ten turns.
+    The residuals of a real heliostat are not white noise but have a broad hump of slow waves. At
+    Jülich the hump is twice as high as white noise, up to about ten turns.
     """
     rest = [_without(m, drive, ratio) for m in members if m.freedom > FREEDOM]
     if not rest:

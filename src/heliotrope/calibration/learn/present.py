@@ -1,10 +1,10 @@
 """Present parameters of one heliostat, from all its photographs in chronological order.
 
 A fit of constants weights last year's photographs as much as today's. Here that fit only provides
-the linearisation point of each sighting and marks suspect sightings; the values come from the state
-that follows the drift (`stream`), which discounts old sightings as the drive drifts, and weighs
-steps, regimes and faulty sightings. The whole history is replayed, so only the sightings have to be
-stored.
+the linearisation point of each sighting and marks suspect sightings; the values come from a state
+that follows the drift (`stream`). That state discounts old sightings as the drive drifts, and
+allows for steps, regimes and faulty sightings. The whole history is replayed each time, so only the
+sightings have to be stored.
 """
 
 from collections.abc import Sequence
@@ -24,13 +24,12 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 
-#: Number of sightings that are linearised at a time.
+#: Number of sightings that are linearised at once.
 BLOCK = 1000
-#: The values apply to the days after a visit, when motion within hours has returned to its mean,
-#: days.
+#: The values apply this many days after a visit, when motion within hours has returned to its mean.
 AHEAD = 1.0
-#: The rotation by slope deviations about the mirror's two axes, as constants of the state, and the
-#: standard deviation of a rotation that does not occur, rad.
+#: Names of the rotations due to slope deviations about the mirror's two axes, which are constants
+#: of the state, and the standard deviation that keeps a rotation at 0 where none occurs, rad.
 TURN, NO_TURN = ("turn about x", "turn about y"), 1e-9
 
 
@@ -41,10 +40,11 @@ class Flown:
     Attributes
     ----------
     sightings
-        Sightings of heliostat 0, corrected for the mean of the errors that the flight's
-        measurements share, (R,).
+        Sightings of heliostat 0, (R,), corrected for the mean of the errors that the flight's
+        measurements share.
     shift
-        Displacement of their ends by one unit of each of K shared errors, ENU, m, (R, 3, K).
+        Displacement of the ends of the sightings by one unit of each of K shared errors, ENU, m,
+        (R, 3, K).
     covariance
         Covariance of these errors, from everything known about them except this mirror, (K, K).
     turn_sigma
@@ -66,8 +66,9 @@ def replayed(
 ) -> Belief:
     """Return the belief about a heliostat after its sightings.
 
-    Errors that measurements of a flight share are also constants of the state: each flight's errors
-    from its first measurement to its last, and the mirror's rotation from the first of all.
+    The errors that the measurements of a flight share are also constants of the state, from the
+    flight's first measurement to its last. The mirror's rotation is a constant from the first
+    measurement of all flights onwards.
 
     Parameters
     ----------
@@ -80,12 +81,12 @@ def replayed(
     hyper
         Hyperparameters of the heliostat's group, for the same parameters.
     flown
-        Its measurements from flights.
+        The heliostat's measurements from flights.
     """
     count = len(fitted.names)
     values, centre = np.zeros(len(hyper.names)), np.zeros(len(hyper.names))
     values[:count] = fitted.values[0]
-    # A start near the nominal only helped the search; the prior stays centred on the nominal.
+    # A start near nominal only helped the search, so the prior stays centred on nominal.
     if (np.abs(fitted.centre[0]) >= MISTAKE * fitted.prior[0]).any():
         centre[:count] = fitted.centre[0]
     moved = mechanism.with_parameters({n: values[p : p + 1] for p, n in enumerate(hyper.names)})
@@ -104,8 +105,8 @@ def replayed(
     if flown:
         turn = np.full(2, max(*(flight.turn_sigma for flight in flown), NO_TURN))
         belief = stream.with_constants(belief, TURN, turn)
-    # Unknown times come first, because they say nothing about drift and a belief does not go back
-    # in time.
+    # Sightings at unknown times come first, because they say nothing about drift and a belief
+    # cannot go back in time.
     order = np.argsort(np.nan_to_num(time, nan=-np.inf), kind="stable")
     for k in order:
         belief = _updated(belief, which[k], parts[which[k]], int(place[k]))
@@ -144,7 +145,7 @@ class _Rows:
     def of_flight(
         cls, moved: Mechanism, flown: Flown, hyper: Hyperparameters, off: FloatArray
     ) -> "_Rows":
-        """Return a flight's linearised sightings; their noise is their own sigma."""
+        """Return a flight's linearised sightings, scaled so that their noise is their sigma."""
         sightings = flown.sightings
         placed = moved[sightings.heliostat]
         line = linearise(placed, sightings, hyper.names)
@@ -167,7 +168,7 @@ class _Rows:
 
 
 def _updated(belief: Belief, number: int, rows: _Rows, k: int) -> Belief:
-    """Return the belief after sighting k of a source: 0 for photographs, or a flight's number."""
+    """Return the belief after sighting k of a source: 0 for photographs, or the flight number."""
     names = rows.names(number)
     if names and k == 0:
         belief = stream.with_constants(belief, names, np.ones(len(names)))
@@ -193,8 +194,8 @@ def hyper_of(
     mechanism, fitted
         The heliostat's mechanism, and its fit.
     group
-        Hyperparameters of its group; parameters and processes that it lacks, or all of them without
-        a group, have the defaults.
+        Hyperparameters of the heliostat's group. Default values apply to the parameters and
+        processes that the group lacks, or to all of them if there is no group.
     """
     hyper = drift.start(mechanism, tuple(fitted.names), priors=fitted.prior[0])
     hyper = replace(hyper, rate=drift.step_rate(()))
@@ -202,7 +203,7 @@ def hyper_of(
 
 
 def _applied(group: Hyperparameters, own: Hyperparameters) -> Hyperparameters:
-    """Return a heliostat's hyperparameters, replaced by its group's where both have them."""
+    """Return a heliostat's hyperparameters, replaced by the group's wherever the group has them."""
     mean, spread = own.mean.copy(), own.spread.copy()
     for p, name in enumerate(own.names):
         # A parameter that only drifts in one of the models has no population there.
@@ -227,7 +228,7 @@ def _applied(group: Hyperparameters, own: Hyperparameters) -> Hyperparameters:
 
 
 def at_present(fitted: FieldFit, belief: Belief, time: float) -> FieldFit:
-    """Return a fit (1,) with the values and covariance of a belief after a POSIX time, s."""
+    """Return a fit (1,) with a belief's values and covariance `AHEAD` days after ``time``, s."""
     count = len(fitted.names)
     values, covariance = belief.at(time / DAY + AHEAD)
     return replace(fitted, values=values[None, :count], covariance=covariance[None, :count, :count])
@@ -240,7 +241,7 @@ def fitting_present(
     group: Hyperparameters | None = None,
     flown: Sequence[Flown] = (),
 ) -> FieldFit:
-    """Return the fit of a heliostat in its state after the latest sighting.
+    """Return the fit of a heliostat, with its values after the latest sighting.
 
     Parameters
     ----------
@@ -251,9 +252,9 @@ def fitting_present(
     fitted
         A robust fit of the sightings, (1,). A failed fit is returned unchanged.
     group
-        Hyperparameters of its group; default: none.
+        Hyperparameters of the heliostat's group; default: none.
     flown
-        Its measurements from flights.
+        The heliostat's measurements from flights.
     """
     times = np.concatenate([sightings.time, *(flight.sightings.time for flight in flown)])
     known = times[np.isfinite(times)]

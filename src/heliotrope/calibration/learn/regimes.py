@@ -13,23 +13,23 @@ import numpy.typing as npt
 from heliotrope.calibration.learn._regime_kernels import FEWEST, partition
 from heliotrope.geometry import FloatArray
 
-#: Cuts are tried at no more than this many positions: the longest gaps.
+#: Cuts are tried in at most this many positions, namely in the longest gaps.
 PLACES = 300
 
 
 def find_regimes(
     time: npt.ArrayLike, residual: npt.ArrayLike, jacobian: npt.ArrayLike, smallest: float = 6.0
 ) -> npt.NDArray[np.int64]:
-    """Return the regime of each sighting of one heliostat: 0 on the common zeros, else from 1.
+    """Return the regime of each sighting of one heliostat: 0 for the common zeros, else from 1.
 
     Parameters
     ----------
     time
-        Seconds, (n,); sightings at NaN are in regime 0.
+        Time in seconds, (n,); sightings with NaN are in regime 0.
     residual
-        Residuals under the common zeros, in units of the noise, (n, 2).
+        Residuals with the common zeros, in units of the noise, (n, 2).
     jacobian
-        Their derivatives with respect to the two zeros, (n, 2, 2).
+        Derivatives of the residuals with respect to the two zeros, (n, 2, 2).
     smallest
         Minimum mean length of the shift, in units of the noise; smaller shifts count as drift.
     """
@@ -52,7 +52,7 @@ def find_regimes(
 def regime_at(
     time: FloatArray, label: npt.NDArray[np.int64], when: FloatArray
 ) -> npt.NDArray[np.int64]:
-    """Return the regime at times ``when`` (m,): that of the sighting nearest in time."""
+    """Return the regime at times ``when`` (m,), which is that of the sighting nearest in time."""
     known = np.flatnonzero(np.isfinite(time))
     if not len(known):
         return np.zeros(len(when), dtype=np.int64)

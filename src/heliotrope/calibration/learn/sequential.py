@@ -1,4 +1,4 @@
-"""Predicts each sighting from the sightings before it, as a plant in service does."""
+"""Predict each sighting from the sightings before it, as a plant in service does."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -22,23 +22,25 @@ from heliotrope.calibration.learn.stream import Belief
 from heliotrope.calibration.learn.unusable import is_usable
 from heliotrope.calibration.sightings import Sightings
 
-#: Sightings predicted at once: memory grows with this times the sightings of a heliostat.
+#: Number of sightings predicted at once. Memory grows with this number times the number of
+#: sightings of a heliostat.
 CHUNK = 50
 
 
 def beliefs_of(learned: Learned) -> tuple[Belief, ...]:
-    """Return the belief of each heliostat after the sightings that it was learnt from.
+    """Return the belief of each heliostat after the sightings from which it was learnt.
 
-    This is overnight work: hyperparameters, the centre of the priors and the derivatives of past
-    sightings come from the batch, with each sighting linearised about the posterior at its time.
-    Steps, regimes and faulty sightings are weighed again as the sightings are replayed.
+    This is done overnight. The hyperparameters, the centre of the priors and the derivatives of
+    past sightings come from the learnt field, with each sighting linearised about the posterior at
+    its time. Steps, regimes and faulty sightings are assessed anew as the sightings are replayed.
     ``stream.observe`` then continues with new sightings.
     """
     sightings = learned.sightings
     beliefs = []
     for i, member in enumerate(learned.members):
         rows = np.flatnonzero((sightings.heliostat == i) & learned.used & ~learned.unusable)
-        # Unknown times first: they say nothing about drift, and a belief does not go back.
+        # Sightings at unknown times come first, because they say nothing about drift and a belief
+        # cannot go back in time.
         when = np.nan_to_num(sightings.time[rows], nan=-np.inf)
         rows = rows[np.argsort(when, kind="stable")]
         belief = stream.begin(member.hyper, member.data.centre, member.data.own)
@@ -93,7 +95,7 @@ def predict_in_turn(
 
     The hyperparameters remain those of the training part, so other heliostats contribute only
     through the population. For every prediction the parameters, regimes, steps and outliers are
-    learnt again from the whole history. Simultaneous sightings do not influence each other.
+    learnt again from all the earlier sightings. Simultaneous sightings do not influence each other.
 
     Parameters
     ----------
@@ -120,7 +122,7 @@ def _predict(
     priors: dict[str, npt.ArrayLike],
     runner: Runner | None,
 ) -> Prediction:
-    """Predict some sightings, each by a copy of its heliostat that has learnt the earlier ones."""
+    """Predict sightings, each from a copy of its heliostat that has learnt the earlier ones."""
     sightings = learned.sightings
     histories = [_before(learned, int(row)) for row in asked]
     owner = np.repeat(np.arange(len(asked)), [len(h) for h in histories])
@@ -141,7 +143,10 @@ def _predict(
 
 
 def _before(learned: Learned, row: int) -> npt.NDArray[np.intp]:
-    """Sightings of the same heliostat before ``row``; for an unknown time, those learnt from."""
+    """Return the earlier sightings of the heliostat of sighting ``row``.
+
+    If the sighting's time is unknown, return those that the field was learnt from.
+    """
     sightings: Sightings = learned.sightings
     mine = sightings.heliostat == sightings.heliostat[row]
     when = sightings.time[row]

@@ -1,4 +1,4 @@
-r"""The streaming learner: the belief about one heliostat, updated by each new sighting.
+r"""The streaming learner: the belief about one heliostat, updated with each new sighting.
 
 The model is that of `drift`, written as a state instead of a covariance between sightings: the
 constants, the offsets of the zeros in the present regime, and the Ornstein-Uhlenbeck processes,
@@ -6,12 +6,12 @@ constants, the offsets of the zeros in the present regime, and the Ornstein-Uhle
 $$ d(t + Δ) = e^{-Δ/τ} d(t) + w, \qquad \langle w^2 \rangle = a^2 (1 - e^{-2Δ/τ}). $$
 
 A sighting is linear in the state, so the belief remains Gaussian (Kalman 1960), and equals the
-batch posterior for the same derivatives and events. What happened since the previous sighting is
-unknown: nothing, a step of the zeros, the start or the end of a regime, or the sighting itself is
-faulty. Each possibility is a hypothesis with a weight, which is multiplied by the probability
-density of each sighting; later sightings decide between the hypotheses (a Gaussian sum: Alspach &
-Sorenson 1972, IEEE Transactions on Automatic Control 17). All inputs, including the time, are
-arguments, and every function returns a new belief.
+batch posterior for the same derivatives and events. It is unknown what happened since the previous
+sighting: perhaps nothing, or a step of the zeros, or the start or the end of a regime, or the
+sighting itself is faulty. Each possibility is a hypothesis. Its weight is multiplied by the
+probability density of each sighting, so that later sightings decide between the hypotheses (a
+Gaussian sum filter: Alspach & Sorenson 1972, IEEE Transactions on Automatic Control 17). All
+inputs, including the time, are arguments, and every function returns a new belief.
 """
 
 import math
@@ -30,19 +30,20 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 
-#: New regimes per day (a reference lost, a repair), and returns from a regime. The training part of
-#: Jülich contains two in 18,000 heliostat days, and 24 faulty sightings among 925.
+#: New regimes per day (after a lost reference or a repair), and returns from a regime per day. The
+#: Jülich training data contain two new regimes in 18,000 heliostat days, and 24 faulty sightings
+#: among 925.
 LOST, FOUND = 1.0 / 10_000.0, 1.0 / 200.0
-#: Share of sightings that show something else.
+#: Fraction of sightings that do not show the heliostat's beam.
 MISTAKES = 0.025
-#: Standard deviation of a mistaken beam, in units of a sighting's sigma (50 mrad at 0.5 mrad).
+#: Standard deviation of a faulty sighting, in units of its stated sigma (50 mrad for 0.5 mrad).
 FAR = 100.0
-#: Hypotheses that weigh less than this together do not widen an ellipse of 90 %.
+#: The lightest hypotheses, with less than this total weight, do not widen a 90 % ellipse.
 IGNORED = 0.05
 
 
 class Event(IntEnum):
-    """What happened between two sightings; `UNKNOWN` weighs all possibilities."""
+    """What happened between two sightings; `UNKNOWN` allows for every possibility."""
 
     UNKNOWN = kernels.UNKNOWN
     NOTHING = kernels.NOTHING
@@ -53,16 +54,16 @@ class Event(IntEnum):
 
 @dataclass(frozen=True)
 class Layout:
-    """Positions in the state, and the hyperparameters that `kernels.update` needs.
+    """Indices into the state, and the hyperparameters that `kernels.update` needs.
 
     Attributes
     ----------
     view
         Matrix from the state to the parameters, (P, S).
     zeros, offsets
-        Positions of the zeros' constants and of their offsets in a regime, (Z,).
+        Indices of the constants of the drive zeros, and of their offsets in a regime, (Z,).
     first
-        Position of the first process.
+        Index of the first process.
     step, lost
         Variances of a step and of the offset in a regime, (Z,).
     tau
@@ -79,7 +80,7 @@ class Layout:
 
 
 def layout_of(hyper: Hyperparameters) -> Layout:
-    """Return the layout of the state under ``hyper``."""
+    """Return the layout of the state for given hyperparameters."""
     zeros = np.flatnonzero(hyper.step > 0).astype(np.int64)
     size, first = len(hyper.names), len(hyper.names) + len(zeros)
     offsets = size + np.arange(len(zeros), dtype=np.int64)
@@ -106,8 +107,8 @@ class Belief:
     weight
         Weights of the K hypotheses, the heaviest first, (K,).
     mean, covariance
-        The state under each hypothesis, as constants minus ``centre``, offsets, processes: means
-        and covariances, (K, S), (K, S, S).
+        Mean and covariance of the state under each hypothesis, (K, S) and (K, S, S). The state
+        consists of constants minus ``centre``, offsets, and processes.
     regime
         Whether the zeros are shifted under each hypothesis, (K,).
     time
@@ -133,7 +134,7 @@ class Belief:
     density: float = 0.0
 
     def document(self) -> dict[str, Any]:
-        """Return the state for JSON, without the hyperparameters, which belong to the field."""
+        """Return the state as a JSON object, without the hyperparameters of the field."""
         return {
             "centre": self.centre.tolist(),
             "weight": self.weight.tolist(),
@@ -147,10 +148,10 @@ class Belief:
         }
 
     def at(self, time: float) -> tuple[FloatArray, FloatArray]:
-        """Return parameters (P,) and covariance (P, P) at a time, days, not in the past.
+        """Return parameters (P,) and their covariance (P, P) at a time in days, not in the past.
 
-        The hypotheses count by weight; the lightest are ignored as long as their weights sum to
-        less than `IGNORED`. NaN: at an unknown time.
+        The hypotheses are averaged by weight; the lightest are ignored as long as their weights sum
+        to less than `IGNORED`. NaN stands for an unknown time.
         """
         h, state, gap = self.hyper, self.layout, self.days_since(time)
         many = int(np.searchsorted(np.cumsum(self.weight), 1.0 - IGNORED)) + 1
@@ -171,7 +172,7 @@ class Belief:
         return self.centre + state.view @ mean, spread
 
     def days_since(self, time: float) -> float:
-        """Return the days since the latest sighting; infinite at an unknown time."""
+        """Return the days since the latest sighting; infinity if the time is unknown."""
         if not math.isfinite(time):
             return math.inf
         return 0.0 if math.isnan(self.time) else max(time - self.time, 0.0)
@@ -233,8 +234,8 @@ def begin(
 def with_constants(belief: Belief, names: tuple[str, ...], spread: FloatArray) -> Belief:
     """Return the belief with more constants, of mean 0 and standard deviations ``spread`` (K,).
 
-    They may be errors shared by some sightings, such as those of a flight, and can be removed again
-    after these sightings (`without_constants`).
+    Such constants may be errors that some sightings share, for example those of one flight.
+    `without_constants` removes them after these sightings.
     """
     h, place = belief.hyper, len(belief.hyper.names)
     nothing, more = np.zeros(len(names)), np.asarray(spread, dtype=np.float64)
@@ -266,7 +267,7 @@ def with_constants(belief: Belief, names: tuple[str, ...], spread: FloatArray) -
 
 
 def without_constants(belief: Belief, names: tuple[str, ...]) -> Belief:
-    """Return the belief without some of its constants, whatever their values."""
+    """Return the belief without some of its constants, averaged over their possible values."""
     h = belief.hyper
     removed = np.array([h.names.index(name) for name in names], dtype=np.intp)
     kept = np.delete(np.arange(belief.mean.shape[1]), removed)
@@ -307,8 +308,8 @@ def update(
     value
         Residual to be explained by the deviations of the parameters from the centre, (2,).
     time
-        Days, not before the previous sighting; NaN: unknown, so the sighting shares no drift with
-        others.
+        Time in days, not before the previous sighting. NaN if unknown; the sighting then shares no
+        drift with other sightings.
     event
         Event known to have happened before the sighting, for example from a maintenance log.
     """
@@ -340,7 +341,7 @@ def update(
 
 
 def _chances(rate: float, days: float) -> FloatArray:
-    """Prior probabilities of the events before a sighting, and of a faulty sighting, (5,)."""
+    """Return the prior probabilities of the events before a sighting, and of a faulty one, (5,)."""
     chance = np.zeros(5)
     chance[kernels.BLUNDER] = MISTAKES
     if days > STEP_GAP:
@@ -363,7 +364,8 @@ def observe(
     mechanism
         Nominal mechanism of the heliostat, (1,).
     sighting
-        One sighting, of heliostat 0. A sighting beyond the reach of the drives changes nothing.
+        One sighting, with heliostat index 0. A sighting beyond the reach of the drives changes
+        nothing.
     event
         As for `update`.
     """

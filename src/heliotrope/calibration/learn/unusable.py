@@ -1,8 +1,8 @@
 """Sightings that a mechanism cannot produce.
 
-Counts beyond the reach of a jack (its triangle is fully extended) do not move the joint further.
-The derivative is infinite there, and one such sighting would corrupt the whole field, so it is left
-out.
+Once the triangle of a jack is fully extended, further counts do not move the joint. The derivative
+there is infinite, so one sighting with such counts would corrupt the whole field. Such sightings
+are left out.
 """
 
 import numpy as np
@@ -13,13 +13,14 @@ from heliotrope.calibration.fit.residuals import Linearised, linearise
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.mechanism.chain import Mechanism
 
-#: Largest derivative of a whitened residual. A jack at a hundredth of a radian from its flat
-#: triangle reaches 1e5 with a centroid of 0.5 mrad; beyond the triangle it is 1e16 or infinite.
+#: Largest derivative of a whitened residual in a usable sighting. A jack a hundredth of a radian
+#: from full extension reaches 1e5 if the centroid has a sigma of 0.5 mrad; beyond full extension
+#: the derivative is 1e16 or infinite.
 STEEPEST = 1e7
 
 
 def is_usable(line: Linearised) -> npt.NDArray[np.bool_]:
-    """Return whether residuals and derivatives are those of a mechanism within its reach, (M,)."""
+    """Return whether each sighting's residual and derivative are within the drives' reach, (M,)."""
     with np.errstate(invalid="ignore"):
         flat = (np.abs(line.jacobian) < STEEPEST).all(axis=(1, 2))
     return np.asarray(flat & np.isfinite(line.residual).all(axis=1))
@@ -28,14 +29,14 @@ def is_usable(line: Linearised) -> npt.NDArray[np.bool_]:
 def find_unusable(
     mechanism: Mechanism, sightings: Sightings, fitted: FieldFit
 ) -> npt.NDArray[np.bool_]:
-    """Return the mask of sightings beyond the reach at the start of a fit or at its end, (M,).
+    """Return a mask of the sightings beyond the drives' reach at the start or end of a fit, (M,).
 
     If a fit found no possible parameters, none of its sightings is usable.
 
     Parameters
     ----------
     mechanism
-        Nominal, (N,).
+        Nominal mechanisms, (N,).
     sightings
         M sightings of these heliostats.
     fitted

@@ -1,4 +1,4 @@
-"""Learns one group in its own process: ``python -m heliotrope.calibration.learn.worker``.
+"""Learn one group in its own process: ``python -m heliotrope.calibration.learn.worker``.
 
 A plant starts this process at night and writes a pickled `GroupTask` to its input; the process
 replies with one JSON document and ends. It uses only CPU time that other processes leave free.
@@ -19,18 +19,18 @@ from heliotrope.calibration.learn.group import (
 from heliotrope.errors import InputError
 from heliotrope.processes import give_way
 
-#: Threads of the process; the plant needs the other cores for its own work.
+#: Number of threads of the process; the plant needs the other cores for its own work.
 ENVIRONMENT = {"HELIOTROPE_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 _LEAST_URGENT = 19
 
 
 def asked(task: GroupTask) -> bytes:
-    """Return a task for the input of the process."""
+    """Return a task as the bytes to send to the process."""
     return pickle.dumps(task)
 
 
 def answered(text: bytes) -> LearntGroup:
-    """Return the result of the learning process.
+    """Return the learnt group from the text that the process printed.
 
     Raises
     ------

@@ -1,10 +1,10 @@
-"""Plans measurements: the sun positions and targets that are most informative per heliostat.
+"""Plan measurements: the sun positions and targets that are most informative per heliostat.
 
 `plan_sightings` chooses among the `candidate_sightings` of one heliostat, `plan_each` does so for
 several heliostats that share targets, and `plan_campaign` schedules a whole field; `fleets_of`
 prepares the heliostats of a plant. `plan_commission` plans the first days of a new field until a
-goal is reached. Tables and plots are in `calibration.plan.report`, covariance updates for one more
-sighting in `calibration.plan.gain`.
+goal is reached. Tables and plots are in `calibration.plan.report`; covariance updates for one more
+sighting are in `calibration.plan.gain`.
 """
 
 from heliotrope.calibration.plan.campaign import CalibrationCampaign, Timing, plan_campaign

@@ -1,10 +1,11 @@
-"""Allocates a day's calibration beams to intervals and targets.
+"""Allocate a day's calibration beams to intervals and targets.
 
-An option is an interval on a target with capacity for some beams. The beam with the greatest gain
-is allocated repeatedly (greedy choice under capacities, Fisher, Nemhauser & Wolsey 1978). Gains
-only decrease as heliostats become better known, so an outdated gain is recomputed only when it
-comes to the top (Minoux 1978). Because the greedy choice does not look ahead, beams are then moved
-and exchanged between options as long as the sum of squared errors decreases.
+An option is a target during an interval, with room for a certain number of beams. The beam with the
+greatest gain is allocated repeatedly (greedy choice under capacities, Fisher, Nemhauser & Wolsey
+1978). Gains only decrease as heliostats become better known, so an outdated gain is recomputed only
+when its heliostat reaches the top of the list (Minoux 1978). Because the greedy choice does not
+look ahead, beams are then moved and exchanged between options as long as the sum of squared errors
+decreases.
 """
 
 from collections.abc import Sequence
@@ -18,9 +19,9 @@ from heliotrope.calibration.plan import gain as _gain
 from heliotrope.calibration.uncertainty import CHUNK
 from heliotrope.geometry import FloatArray, as_float
 
-#: Maximum number of beams tried for moves and exchanges, which takes some seconds.
+#: Maximum number of beams to move and exchange; more would take more than some seconds.
 TRIES = 4_000
-#: Sweeps over all beams, options tried for each, and partners tried in each.
+#: Sweeps over all beams, options tried for each beam, and partners tried in each option.
 SWEEPS, DEPTH, PARTNERS = 8, 4, 64
 
 
@@ -31,13 +32,13 @@ class Option:
     Attributes
     ----------
     rows
-        Heliostats whose beams can reach it, (n,).
+        Indices of the heliostats whose beams can reach the target, (n,).
     slope
-        Whitened derivatives by the scaled parameters, (n, 2, P).
+        Whitened derivatives with respect to the scaled parameters, (n, 2, P).
     room
         Number of beams that fit into the interval.
     most
-        Maximum number of visits of each heliostat, (n,).
+        Maximum number of visits per heliostat, (n,).
     """
 
     rows: npt.NDArray[np.intp]
@@ -47,7 +48,7 @@ class Option:
 
 
 def gains(covariance: FloatArray, form: FloatArray, option: Option) -> FloatArray:
-    """Decrease of the expected squared error by one sighting of each heliostat, rad², (n,)."""
+    """Return how much one sighting lowers each expected squared error, rad², (n,)."""
     falls = np.empty(len(option.rows))
     for a in range(0, len(falls), CHUNK):
         part = option.rows[a : a + CHUNK]
@@ -68,11 +69,11 @@ def allocate(
     Parameters
     ----------
     covariance, form
-        (N, P, P); not changed.
+        Covariance of the parameters, and quadratic form of the error, (N, P, P); not changed.
     options
         Options in any order.
     worth
-        A sighting must lower the heliostat's expected squared error by this share.
+        Minimum fraction by which a sighting must lower the heliostat's expected squared error.
     count
         Maximum number of sightings in total; default: no limit.
     """
@@ -127,11 +128,11 @@ class _Exchange:
                 self.information[i] += self.square(o, i)
 
     def slope(self, o: int, rows: int | list[int]) -> FloatArray:
-        """Derivatives of heliostats in an option."""
+        """Return the derivatives of heliostats in an option."""
         return np.asarray(self.options[o].slope[self.place[o, rows]])
 
     def square(self, o: int, i: int) -> FloatArray:
-        """Information of one sighting, (P, P)."""
+        """Return the information from one sighting, (P, P)."""
         slope = self.slope(o, i)
         return np.asarray(slope.T @ slope)
 
@@ -141,7 +142,10 @@ class _Exchange:
         return bool(k >= 0 and self.chosen[o].count(i) < self.options[o].most[k])
 
     def better(self, o: int, i: int) -> bool:
-        """Move a beam of ``i`` away from option ``o``, or exchange it, if that lowers the error."""
+        """Move or exchange a beam of ``i`` in option ``o`` if that lowers the error.
+
+        Return whether it did.
+        """
         rest = as_float(np.linalg.inv(self.information[i] - self.square(o, i)))
         others = np.array([p for p in range(len(self.options)) if p != o and self.able(p, i)])
         if not others.size:
@@ -164,7 +168,7 @@ class _Exchange:
         return self._replace(o, i, rest)
 
     def _replace(self, o: int, i: int, rest: FloatArray) -> bool:
-        """Give the slot of a beam of ``i`` to a heliostat that gains more from it."""
+        """Replace a beam of ``i`` by the beam of a heliostat that gains more from the slot."""
         rows = self.options[o].rows
         rows = rows[:: max(1, -(-len(rows) // PARTNERS))]
         new = [int(b) for b in rows if b != i and self.able(o, int(b))]
@@ -181,7 +185,10 @@ class _Exchange:
         return True
 
     def _partner(self, o: int, p: int, i: int, gain: float) -> int | None:
-        """Heliostat of option ``p`` that loses least in ``o``, if it loses less than ``gain``."""
+        """Return the heliostat of option ``p`` that loses least by a move to option ``o``.
+
+        Returns None if it would lose at least ``gain``.
+        """
         rows = [b for b in dict.fromkeys(self.chosen[p]) if b != i and self.able(o, b)]
         rows = rows[:: max(1, -(-len(rows) // PARTNERS))]
         if not rows:
@@ -193,7 +200,7 @@ class _Exchange:
         form = self.form[rows]
         change = _gain.variance_gain(rest, slope_o, form) - _gain.variance_gain(rest, slope_p, form)
         best = int(np.argmax(change))
-        # The margin prevents rounding errors from exchanging two beams for ever.
+        # The margin prevents rounding errors from exchanging two beams back and forth for ever.
         return rows[best] if change[best] > -gain * (1.0 - 1e-6) else None
 
     def _move(self, o: int, p: int, i: int) -> None:

@@ -1,10 +1,11 @@
-"""Plans a campaign: which heliostat is measured on which target at what time.
+"""Plan a campaign: which heliostat is measured on which target at what time.
 
 A target takes one beam at a time. Its time is divided into slots of equal length (settle, expose,
-clear). Either each day is planned as a whole, so that every heliostat is measured in its most
-informative hours as far as capacity allows; or each slot is assigned to the heliostat whose
-sighting then reduces the field's expected squared beam error most. Heliostats slew while others are
-measured; each comes from its aim point and returns to it.
+clear). There are two ways to plan. Either each day is planned as a whole, so that every heliostat
+is measured in its most informative hours as far as capacity allows. Or each slot is assigned to the
+heliostat whose sighting at that time reduces the field's expected squared beam error most.
+Heliostats slew while other heliostats are measured; each comes from its aim point and returns to
+it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -38,11 +39,11 @@ class Timing:
     Attributes
     ----------
     settle
-        From the arrival of the beam until the beam is steady.
+        Time from the arrival of the beam until it is steady.
     exposure
         Exposure of the camera.
     clear
-        From the exposure until the beam has left the target and the next beam may arrive.
+        Time from the exposure until the beam has left the target and the next beam may arrive.
     """
 
     settle: float = 5.0
@@ -79,8 +80,7 @@ class CalibrationCampaign:
     counts
         Drive counts at ``time``, (M, D).
     heliostat_error, error
-        Expected RMS beam error of this heliostat and of the field after the sighting,
-        rad, (M,).
+        Expected RMS beam error after each sighting, of its heliostat and of the field, rad, (M,).
     before
         Expected RMS beam error of the field before the campaign, rad.
     expected
@@ -133,7 +133,7 @@ def plan_campaign(
     Parameters
     ----------
     fleets
-        The heliostats, kind by kind.
+        The heliostats, one fleet per kind.
     site
         Location and atmosphere.
     targets
@@ -146,21 +146,21 @@ def plan_campaign(
         Interval at which the gains of the whole field are computed, s; the gains of the chosen
         sightings are computed for their actual times.
     ahead
-        Whether to plan each day as a whole, so that the error is smallest at its end; otherwise
-        slot by slot, so that the error falls fastest.
+        Whether to plan each day as a whole, so that the error is smallest at the end of the day.
+        Otherwise the day is planned slot by slot, so that the error falls fastest.
     worth
         Minimum fraction by which a measurement must reduce the heliostat's own expected squared
         error; a slot in which no measurement does so stays empty.
     count
         Maximum number of measurements; default: no limit.
     progress
-        Called with the numbers of slots (done, total) after each interval.
+        Called after each interval with the numbers of slots, (done, total).
 
     Returns
     -------
-    In the schedule no two beams share a target, no heliostat is in two places at once, each leaves
-    its aim in time, and stops and limits are respected. The return slew is assumed to take as long
-    as the outward slew.
+    The schedule, in which no two beams share a target, no heliostat is in two places at once, each
+    heliostat leaves its aim in time, and stops and limits are respected. The return slew is assumed
+    to take as long as the outward slew.
 
     Raises
     ------
@@ -209,7 +209,7 @@ def plan_campaign(
 def _cells(
     schedule: "_Schedule", start: float, stop: float, every: float
 ) -> tuple[list[tuple[float, FloatArray]], int]:
-    """Pairs (begin of daylight, arrivals of some slots), and the number of slots."""
+    """Return pairs (begin of daylight, arrivals of some slots), and the number of slots."""
     slot = schedule.timing.slot
     number = int(np.floor((stop - start) / slot + 1e-9))
     if not 1 <= number <= 2_000_000:
@@ -264,11 +264,11 @@ class _Schedule:
 
     @property
     def full(self) -> bool:
-        """Whether the largest number of measurements is reached."""
+        """Whether the maximum number of measurements has been reached."""
         return self.limit is not None and len(self.rows) >= self.limit
 
     def day(self, begin: float, cells: list[FloatArray]) -> Iterator[FloatArray]:
-        """Plan the intervals of a day that begins at ``begin``; yields each when it is done."""
+        """Plan the intervals of a day that starts at ``begin``; yield each when it is planned."""
         size = self.covariance[:, :2].nbytes * len(self.targets)
         look = max(1, int(MEMORY // size)) if self.ahead else 1
         for first in range(0, len(cells), look):
@@ -294,12 +294,12 @@ class _Schedule:
 
     @property
     def _shift(self) -> float:
-        """From the arrival of a beam to the middle of the exposure, s."""
+        """Return the time from the arrival of a beam to the middle of the exposure, s."""
         return self.timing.settle + 0.5 * self.timing.exposure
 
     def _option(self, view: TargetView, room: int) -> _allocation.Option:
         rows = np.flatnonzero(view.able)
-        # A heliostat returns to its aim before it comes again.
+        # A heliostat returns to its aim before its next visit.
         again = self.timing.slot + 2.0 * view.seconds[rows]
         most = np.floor((room * self.timing.slot + 2.0 * view.seconds[rows]) / again)
         return _allocation.Option(rows, view.slope[rows], room, most.astype(np.intp))
@@ -314,7 +314,7 @@ class _Schedule:
                 self._fill(j, queue, begin, float(arrive), sun)
 
     def _fill(self, j: int, queue: "_Queue", begin: float, arrive: float, sun: FloatArray) -> None:
-        """Assign one slot of target ``j`` to the first heliostat in its queue that can be there."""
+        """Assign one slot of target ``j`` to the first queued heliostat that can be in place."""
         waiting: list[tuple[float, int, int]] = []
         while queue.heap:
             entry = heappop(queue.heap)
@@ -327,8 +327,8 @@ class _Schedule:
                 waiting.append(entry)
                 continue
             own = self.field.single(i, sun, self.targets[j])
-            # The queue applies to the middle of the interval, but the target may be out of reach in
-            # the slot itself.
+            # The queue was computed for the middle of the interval, but the target may be out of
+            # reach in this slot.
             if not own.able[0]:
                 continue
             if arrive - own.seconds[0] < ready:
@@ -390,8 +390,9 @@ class _Queue:
     """Heliostats for one target during an interval, the greatest gain first.
 
     Either the order ``wanted`` is fixed, or the queue holds all heliostats within reach with their
-    gain at the middle of the interval. An entry of a heliostat that has been measured since is
-    outdated, which its version shows; its gain is renewed when it comes to the top.
+    gain at the middle of the interval. If a heliostat has been measured since its entry was made,
+    the version of the entry shows that it is outdated. Its gain is recomputed when it reaches the
+    top.
     """
 
     def __init__(
@@ -415,7 +416,7 @@ class _Queue:
         heapify(self.heap)
 
     def push(self, i: int) -> None:
-        """Enter heliostat ``i`` with its present gain."""
+        """Enter heliostat ``i`` with its current gain."""
         schedule = self.schedule
         if self.settled:
             return

@@ -1,12 +1,13 @@
-"""Plans the commissioning of a field, in days: from installation errors to the accuracy goal.
+"""Plan the commissioning of a field over days: from installation errors to the accuracy goal.
 
-A target takes the calibration visits one after the other, as in a running plant: first joint first
-visits, then joint visits that are due, then single visits for heliostats that a joint visit did not
-find. Within each kind, the heliostats whose visits reduce the expected squared error of the field
-most per second come first. Gains are computed for all heliostats at the middle of each half-hour
-interval, in which each heliostat is visited at most once; the gains of different heliostats are
-independent. A plant that measures heliostats on its receiver has one more place for visits, open to
-heliostats that are known well enough; they stay at their aims.
+A target takes the calibration visits one after the other, as in a running plant: first come joint
+visits of heliostats that were never measured, then joint visits that are due, then single visits
+for heliostats whose beams a joint visit did not find. Within each kind, the heliostats whose visits
+reduce the expected squared error of the field most per second come first. Gains are computed for
+all heliostats at the middle of each half-hour interval, in which each heliostat is visited at most
+once; the gains of different heliostats are independent. A plant that measures heliostats on its
+receiver has one more place for visits. It is open to heliostats that are known well enough, which
+stay at their aims.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -31,9 +32,9 @@ from heliotrope.sun import Site
 
 #: Maximum number of positions at which a search looks for a beam.
 LOOKS = 25
-#: Percentiles of the curve.
+#: Percentiles of the beam error that the curve shows, as fractions.
 SHARES = (0.5, 0.9)
-#: A target that is used for more than this share of its time limits the plan.
+#: A target that is in use for more than this fraction of the time limits the plan.
 _BUSY = 0.9
 
 Mask = npt.NDArray[np.bool_]
@@ -53,10 +54,10 @@ class CommissionTerms:
     goal
         Beam error that 90 % of the heliostats must not exceed, RMS over the year, rad.
     settle, shots, interval
-        Durations in a single visit, s: until the heliostat is steady, and for its photographs; 80 s
-        in total.
+        Time in a single visit until the heliostat is steady, number of photographs, and time
+        between them, s; 80 s in total by default.
     look
-        Time of each further search photograph when the beam is not on the target, s.
+        Time for each further search photograph if the beam is not on the target, s.
     sigma
         Standard deviation of the beam position in a photograph, per direction, rad.
     joint
@@ -64,12 +65,12 @@ class CommissionTerms:
     receiver
         Receiver visits; None: no receiver visits.
     repeat
-        Random part of the beam error, drawn anew at each visit and in operation, standard deviation
-        per direction, rad.
+        Standard deviation per direction of the random part of the beam error, rad. This part is
+        different at each visit and in operation.
     worth
         Minimum fraction of a heliostat's expected squared error that a visit must remove.
     clear
-        Fraction of the time without clouds.
+        Fraction of the time that is free of clouds.
     every
         Interval at which gains are computed, s.
     limits
@@ -113,12 +114,12 @@ class CommissionTerms:
         return self.settle + self.shots * self.interval
 
     def accuracy(self, together: bool, *, produces: bool = False) -> float:
-        """Standard deviation per direction that a visit achieves, rad.
+        """Return the standard deviation per direction that a visit achieves, rad.
 
         Parameters
         ----------
         together, produces
-            Whether it is a coded visit, and whether it is a receiver visit.
+            Whether the visit is coded, and whether it is a receiver visit.
         """
         terms = self.receiver if produces else self.joint if together else None
         noise = self.sigma / np.sqrt(self.shots) if terms is None else terms.sigma
@@ -141,13 +142,13 @@ class Visit:
     target
         Index of the target; the receiver has the index after the last target.
     heliostats
-        Their indices over all fleets, (n,).
+        Heliostat indices over all fleets, (n,).
     joint
-        Whether coded movements distinguish them.
+        Whether coded movements distinguish the heliostats.
     own
-        Whether each has its own code, and a second stack verifies them.
+        Whether each heliostat has its own code, and a second stack verifies the new parameters.
     first
-        Whether any of them was never measured before.
+        Whether any of the heliostats was never measured before.
     missed
         Which beams are expected to miss the target in a joint first visit, (n,).
     after
@@ -172,18 +173,18 @@ class CommissionPlan:
     Attributes
     ----------
     visits
-        In order of their start times.
+        Visits in order of their start times.
     time
         POSIX s of the curve, (K,): the start, and the end of each interval.
     percentiles, rms
         Predicted 50th and 90th percentile of the field's beam error, and its RMS, rad, (K, 2) and
         (K,).
     seconds
-        Time of all targets by use: "photographs", "search", "travel" and "idle", s.
+        Total time of all targets for each use ("photographs", "search", "travel" and "idle"), s.
     days
         Start and end of each day's sunlight, POSIX s.
     terms
-        The terms.
+        Terms of the plan.
     unseen
         Heliostats that remain unmeasured at the end.
     """
@@ -211,7 +212,7 @@ class CommissionPlan:
 
     @property
     def limit(self) -> str:
-        """The obstacle that keeps the plan from its goal, in one clause; empty if reached."""
+        """What keeps the plan from its goal, in one clause; an empty string if it is reached."""
         if self.reached is not None:
             return ""
         total = sum(self.seconds.values())
@@ -252,7 +253,7 @@ def plan_commission(
     terms: CommissionTerms | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> CommissionPlan:
-    """Return the visits of a commissioning, up to the goal or the end of the time span.
+    """Return the visits of a commissioning, until the goal or the end of the time span is reached.
 
     Parameters
     ----------
@@ -265,11 +266,12 @@ def plan_commission(
     size
         Longer side of the mirrors, m, () or (N,).
     measured
-        Heliostats measured before, for example by a drone, () or (N,).
+        Whether each heliostat was measured before, for example by a drone, () or (N,).
     missed
         Number of joint first visits that each heliostat's beam has missed so far, () or (N,).
     held
-        Heliostats that cannot be visited, () or (N,); they still count in the field's errors.
+        Whether each heliostat cannot be visited, () or (N,). Such heliostats still count in the
+        field's errors.
     terms
         Default: `CommissionTerms()`.
     progress
@@ -318,7 +320,7 @@ def plan_commission(
 def _cells(
     site: Site, start: float, stop: float, terms: CommissionTerms
 ) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
-    """Days of sun, and their intervals, each (begin, end)."""
+    """Return the days of sunlight, and their intervals, each as (begin, end)."""
     if not (np.isfinite([start, stop]).all() and 0.0 < stop - start <= 366.0 * 86400.0):
         raise InputError(f"commission: the period must be at most a year, not {start} to {stop} s")
     edges = np.append(np.arange(start, stop, 60.0), stop)
@@ -339,7 +341,7 @@ def _cells(
 
 @dataclass
 class _Queue:
-    """Heliostats in the order of their value; those already taken are skipped."""
+    """Heliostats in order of decreasing value; heliostats already taken are skipped."""
 
     rows: Rows
 
@@ -350,17 +352,17 @@ class _Queue:
             free_rows = self.rows[:reach][free[self.rows[:reach]]]
             if len(free_rows) >= most or reach >= len(self.rows):
                 return free_rows[:most]
-            # Most heliostats at the front have already been taken.
+            # Most heliostats at the front of the queue have already been taken.
             self.rows = self.rows[free[self.rows]]
             reach *= 4
 
 
 @dataclass
 class _Choices:
-    """Visits that a target can take during an interval.
+    """Heliostats from which the visits to a target during an interval are chosen.
 
-    ``alone`` may have a single visit, and ``lost`` of these were never measured; ``new`` are for a
-    joint first visit, and ``known`` for a later joint visit.
+    ``alone`` are candidates for a single visit, and ``lost`` are those of them that were never
+    measured. ``new`` are candidates for a joint first visit, and ``known`` for a later joint visit.
     """
 
     view: TargetView
@@ -397,13 +399,14 @@ class _Commissioning:
         self.times: list[float] = []
         self.curve: list[tuple[float, ...]] = []
         self.seconds = dict.fromkeys(("photographs", "search", "travel", "idle"), 0.0)
-        #: Joint first visits that each beam has missed, and the part of a miss that is owed.
+        #: Number of joint first visits that each beam has missed, and the fraction of a miss
+        #: carried over.
         self.missed, self._owed = np.zeros(count, dtype=np.int64), 0.0
         self._last_joint: Mask = np.zeros(len(targets) + 1, dtype=np.bool_)
         places = len(targets) + (terms.receiver is not None)
-        #: End of the last interval, and the unused time of each place in it, s.
+        #: End of the last interval, and the time that each place did not use in that interval, s.
         self._until, self._unused = -np.inf, np.zeros(places)
-        #: When each mirror's last visit ended, and the last one on the receiver.
+        #: When each heliostat's last visit ended, and when its last receiver visit ended.
         self._home, self._shone = np.full((2, count), -np.inf)
         self._shines: Mask = np.zeros(count, dtype=np.bool_)
         if terms.receiver is not None:
@@ -411,7 +414,7 @@ class _Commissioning:
             self._shines = self.counted & terms.receiver.shining(self.position, aim)
 
     def note(self, now: float) -> None:
-        """Add a point to the curve."""
+        """Add a point to the curve at time ``now``."""
         form, known, common = self.field.form, self.field.covariance, self.terms.floor**2
         middle, high = error_percentiles(form, known, SHARES, common)
         rms = np.sqrt(self.field.squares().sum() / self.field.counted + common)
@@ -432,7 +435,7 @@ class _Commissioning:
         while opened.any():
             j = int(np.argmin(np.where(opened, clock, np.inf)))
             now = float(clock[j])
-            # During that time, some heliostats are still returning from another place.
+            # Some heliostats are still returning from another place during the time left over.
             home = free if now >= begin else free & (self._home <= now)
             rows, joint = self._best(j, choices[j], home)
             span = self._span(j, choices[j], rows, joint) if rows.size else {}
@@ -509,11 +512,11 @@ class _Commissioning:
 
     @property
     def _shining(self) -> int:
-        """Number of mirrors on the receiver."""
+        """Return the number of heliostats that shine on the receiver."""
         return int((self._shines & self.visited & self.measured).sum())
 
     def _best(self, j: int, choices: _Choices, free: Mask) -> tuple[Rows, bool]:
-        """Return the heliostats of the next visit to a place, and whether it is a joint one."""
+        """Return the heliostats of the next visit to a place, and whether the visit is joint."""
         if j == len(self.targets) and (shining := self.terms.receiver) is not None:
             many = choices.known.first(free, shining.at_once(self._shining))
             return (many if len(many) >= shining.settings.least else many[:0]), True
@@ -534,10 +537,10 @@ class _Commissioning:
         return (many, True) if len(many) >= terms.least else (alone, False)
 
     def _span(self, j: int, choices: _Choices, rows: Rows, joint: bool) -> dict[str, float]:
-        """Return the time of a visit by use, s.
+        """Return the time of a visit for each use, s.
 
-        In a joint visit heliostats drive simultaneously and do not search; on the receiver they do
-        not drive either.
+        In a joint visit the heliostats slew simultaneously and there is no search. In a receiver
+        visit they do not slew either.
         """
         if j == len(self.targets) and (shining := self.terms.receiver) is not None:
             return {"photographs": shining.span(len(rows), self._shining)}
@@ -563,7 +566,7 @@ class _Commissioning:
         produces = j == len(self.targets)
         own = joint and not produces and self._own(choices, rows)
         if own:
-            # The stack that verifies new parameters is a sighting, too.
+            # The stack that verifies new parameters is also a sighting.
             missed, stacks = self._misses(choices.share_seen[rows]), 2.0
         scale = np.sqrt(stacks) * self.sigma[rows] / self.terms.accuracy(joint, produces=produces)
         scale = np.where(missed, 0.0, scale)[:, None, None]
@@ -579,7 +582,10 @@ class _Commissioning:
         self.visits.append(Visit(begin, end, j, rows, joint, own, first, missed, after))
 
     def _misses(self, chance: FloatArray) -> Mask:
-        """Return the mask of beams that miss, (n,): the expected number, spread evenly."""
+        """Return a mask of the beams that miss, (n,).
+
+        As many miss as are expected to, spread evenly.
+        """
         due = self._owed + np.cumsum(1.0 - chance)
         self._owed = float(due[-1]) % 1.0
         return np.asarray(np.diff(np.floor(due), prepend=0.0) > 0.0)
@@ -591,5 +597,5 @@ def _descending(value: FloatArray) -> Rows:
 
 
 def mirrors_of(visits: Iterable[Visit]) -> int:
-    """Return the number of sightings of some visits."""
+    """Return the total number of sightings in some visits."""
     return sum(len(visit.heliostats) for visit in visits)

@@ -20,7 +20,7 @@ _HOUR = 3600.0
 
 
 def hour_rows(plan: CommissionPlan, targets: Sequence[str]) -> list[dict[str, Any]]:
-    """Return one record for each hour and place, with the field's prediction at its end."""
+    """Return one record per hour and place, with the error predicted at the end of the hour."""
     rows, places = [], _places(plan, targets)
     order = sorted(plan.visits, key=lambda visit: (visit.begin // _HOUR, visit.target))
     for (hour, target), group in groupby(order, key=lambda v: (v.begin // _HOUR, v.target)):
@@ -50,9 +50,9 @@ def _places(plan: CommissionPlan, targets: Sequence[str]) -> list[str]:
 
 
 def at(plan: CommissionPlan, time: float) -> tuple[float, float]:
-    """Return the predicted 50th and 90th percentile at a time, POSIX s, rad.
+    """Return the predicted 50th and 90th percentiles of the beam error at a POSIX time, s, rad.
 
-    The field is not measured at night: between two days the prediction stays as it is.
+    The field is not measured at night, so the prediction is constant between two days.
     """
     middle, high = (np.interp(time, plan.time, plan.percentiles[:, q]) for q in (0, 1))
     return float(middle), float(high)
@@ -90,7 +90,7 @@ def curve_rows(plan: CommissionPlan) -> list[dict[str, Any]]:
 def document(
     plan: CommissionPlan, heliostats: Sequence[str], targets: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the whole plan for JSON."""
+    """Return the whole plan as a JSON object."""
     places = _places(plan, targets)
     return {
         "targets": list(targets),
@@ -135,7 +135,7 @@ def sentence(plan: CommissionPlan) -> str:
 
 
 def curve_picture(plan: CommissionPlan) -> "Figure":
-    """Return a picture of the predicted percentiles over the hours of sun, and of the visits."""
+    """Return a picture of the visits, and of the predicted percentiles over the hours of sun."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
@@ -167,7 +167,7 @@ def curve_picture(plan: CommissionPlan) -> "Figure":
 
 
 def _days(plan: CommissionPlan) -> Iterator[np.ndarray]:
-    """Indices into the curve, day by day."""
+    """Yield the indices into the curve, day by day."""
     for begin, end in plan.days:
         rows = np.flatnonzero((plan.time >= begin) & (plan.time <= end))
         if rows.size:

@@ -1,4 +1,4 @@
-"""Heliostats to plan for, with the information on their parameters, one fleet per kind."""
+"""The heliostats to plan for, with what is known of their parameters, in one fleet per kind."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Fleet:
-    """N heliostats of one kind, with the information on their parameters.
+    """N heliostats of one kind, with what is known of their parameters.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ def fleets_of(
     year
         Calendar year whose sun positions weight the beam error.
     model
-        A model of the parameter table; "auto": the usual model for the kind of mechanism.
+        A model of the parameter table, or "auto" for the usual model of the kind of mechanism.
     made
         Sightings made so far; indices refer to ``plant.names``.
     sigma
@@ -142,14 +142,14 @@ def fleets_of(
 
 
 def _mean_square(information: FloatArray, form: FloatArray) -> float:
-    """Expected squared beam error of heliostats that can serve their aim, rad²."""
+    """Return the expected squared beam error of heliostats that can serve their aim, rad²."""
     counts = form.any(axis=(1, 2))
     square = np.einsum("npq,nqp->n", form[counts], np.linalg.inv(information[counts]))
     return float(square.mean()) if counts.any() else np.nan
 
 
 def _of(made: Sightings, rows: list[int], total: int) -> Sightings:
-    """The sightings of the heliostats at ``rows`` of the plant, renumbered."""
+    """Return the sightings of the plant's heliostats ``rows``, with indices into ``rows``."""
     number = np.full(total, -1, dtype=np.intp)
     number[rows] = np.arange(len(rows))
     part = made.take(np.flatnonzero(number[made.heliostat] >= 0))
@@ -184,9 +184,9 @@ def plan_each(
     criterion: Criterion = "d",
     progress: Progress | None = None,
 ) -> tuple[dict[str, SightingPlan], CandidateSightings]:
-    """Return a plan for each heliostat by name, and the candidates of the first heliostat.
+    """Return a plan for each heliostat, by name, and the candidates of the first heliostat.
 
-    Each heliostat has its own part of a time step, so that no two are on a target at once.
+    Each heliostat has its own part of a time step, so that no two heliostats use a target at once.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def plan_each(
 def _free(
     candidates: CandidateSightings, taken: set[tuple[int, float]], latest: float
 ) -> npt.NDArray[np.bool_]:
-    """Return a mask of the candidates that end in the span, on a target that is free then."""
+    """Return a mask of the candidates that end within the span, on a target that is then free."""
     pairs = zip(candidates.target, candidates.time, strict=True)
     return np.array(
         [t <= latest and (int(k), float(t)) not in taken for k, t in pairs], dtype=np.bool_

@@ -16,22 +16,25 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.optics.beam import beam_sigma
 
-#: Time of a photograph excluding the settling of the heliostats: movement and exposure, s.
+#: Time for the movement and the exposure of a photograph, excluding the time to settle, s.
 _PHOTOGRAPH = 1.2
-#: Standard deviation of a centroid from a whole stack, rad.
+#: Standard deviation of a centroid found from a whole stack, rad.
 _CENTROID = 1e-4
-#: Number of beams that share a code: 36 heliostats on a 12 m target take 7 codes, 49 take 15. The
-#: second number is for the verification, when they are known less well: 54 take 15, 57 take 31.
+#: Number of beams that share a code: on a 12 m target, 36 heliostats need 7 codes and 49 need 15.
+#: The second number applies to the verification, when heliostats are known less well: 54 need 15
+#: codes and 57 need 31.
 _SHARING, _VERIFYING = 5.2, 3.6
 #: Possible numbers of codes.
 _CODES = (3, 7, 15, 31, 63, 127)
-#: Share of the largest expected error that automatic control allows in a later visit.
+#: Largest expected error in a later visit, as a fraction of the largest that automatic control
+#: allows.
 _SURE = 0.95
-#: Reflected share of the light, and slope error of the mirror surface, rad.
+#: Reflected fraction of the light, and slope error of the mirror surface, rad.
 _REFLECTED, _SLOPE = 0.8, 1e-3
-#: A beam keeps this many standard deviations of its width and of its position from the border.
+#: A beam keeps a distance of this many standard deviations of its width and of its position from
+#: the border.
 _BORDER = 1.5
-#: Standard deviations by which the light may exceed its expectation.
+#: The light may exceed its expectation by this many standard deviations.
 _ABOVE = 2.0
 
 
@@ -44,7 +47,8 @@ class JointTerms:
     most, least
         Maximum number of heliostats in a later visit, and the minimum number for a joint visit.
     first
-        Maximum number of heliostats in a first visit; 0: each heliostat has its first visit alone.
+        Maximum number of heliostats in a first visit; if 0, each heliostat has its first visit
+        alone.
     known
         Expected beam error on the target above which a heliostat joins the first visits, rad RMS.
     tries
@@ -52,8 +56,8 @@ class JointTerms:
     step
         Time per photograph, including the preceding movement, s.
     beside
-        Time of a visit excluding photographs and slews, s: fits, parameter transfer, waiting for
-        the last heliostat.
+        Time of a visit excluding photographs and slews, s. It covers fits, parameter transfer and
+        waiting for the last heliostat.
     sigma
         Standard deviation of a beam position from all photographs of a stack, per direction, rad.
     brightest
@@ -115,9 +119,10 @@ class JointTerms:
         Parameters
         ----------
         mirrors
-            Their number.
+            Number of heliostats.
         own
-            Whether each heliostat has its own code; a second stack then verifies them.
+            Whether each heliostat has its own code; a second stack then verifies the new
+            parameters.
         """
         if not own:
             return 2 * (_codes(mirrors / _SHARING) + 1)
@@ -125,13 +130,13 @@ class JointTerms:
         return _codes(mirrors) + 1 + max(_codes(mirrors / _VERIFYING), _CODES[1]) + 1
 
     def span(self, mirrors: int, *, own: bool) -> float:
-        """Return the time of a visit without slews, s; see `photographs`."""
+        """Return the time of a visit excluding slews, s; for the arguments see `photographs`."""
         return self.beside + self.step * self.photographs(mirrors, own=own)
 
     def fitting(
         self, target: Target, size: FloatArray, slant: FloatArray, spread: FloatArray
     ) -> int:
-        """Return how many heliostats, counted from the first, keep a target below its limit.
+        """Return how many heliostats, counted from the first, a target can take within its limit.
 
         Parameters
         ----------
@@ -145,8 +150,8 @@ class JointTerms:
         Notes
         -----
         The smaller the expected error of a heliostat, the farther from the middle its position may
-        be. While beam positions are unknown the irradiance is random; its expectation plus twice
-        its standard deviation counts.
+        be. While beam positions are unknown, the irradiance is random; its expectation plus twice
+        its standard deviation is compared with the limit.
         """
         power = _REFLECTED * size**2
         beam = beam_sigma(slant, slope=_SLOPE) ** 2 + (0.5 * size) ** 2 / 12.0
@@ -162,5 +167,5 @@ class JointTerms:
 
 
 def _codes(needed: float) -> int:
-    """Return the number of codes of the shortest stack that has as many as needed."""
+    """Return the number of codes in the shortest stack that has at least as many as needed."""
     return next((codes for codes in _CODES if codes >= needed), _CODES[-1])

@@ -7,9 +7,9 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.optics.beam import SUN_RADIUS
 
-#: Distance between neighbouring aims of a search, as a share of the target's shorter side.
+#: Distance between neighbouring aims of a search, as a fraction of the target's shorter side.
 PITCH = 0.8
-#: Number of joint first visits that look for a beam, at the middle of the target and around it.
+#: Number of joint first visits that search for a beam, at the middle of the target and around it.
 LOOKS = 9
 #: A stack finds a beam whose centre is this far inside the target, m.
 _INSIDE = 0.5
@@ -27,11 +27,11 @@ def chance_on_target(
     position, size
         Feet of the heliostats (N, 3) and the larger sides of their mirrors (N,), m.
     spread
-        Expected squared beam error of both directions together, rad², (N,).
+        Expected squared beam error, summed over both directions, rad², (N,).
     """
     sigma = _deviation(target, position, spread)
     distance = np.linalg.norm(target.center - position, axis=1)
-    # The beam's own radius: half a mirror, and the sun's disc.
+    # The beam's own radius is that of half a mirror plus the sun's disc.
     radius = 0.5 * size + SUN_RADIUS * distance
     half = 0.5 * np.array([target.width, target.height])
     room = np.maximum(half - radius[:, None], 0.1 * half)
@@ -42,15 +42,16 @@ def chance_on_target(
 def chance_by_try(
     target: Target, position: FloatArray, spread: FloatArray, tries: int
 ) -> FloatArray:
-    """Return the probability that a stack finds a beam which earlier stacks have missed, (K, N).
+    """Return the probability that each try finds a beam that earlier tries missed, (K, N).
 
-    The aim of each try is that of `search_places`; the other parameters are those of
-    `chance_on_target`. A beam is found whose centre is on the target.
+    A beam is found if its centre is on the target. The aims of the tries are those of
+    `search_places`; the other parameters are those of `chance_on_target`.
     """
     sigma = _deviation(target, position, spread)
     room = np.broadcast_to(reach_of(target), sigma.shape)
     places = search_places(target, tries)
-    # The edges of all windows cut the plane into cells, each of which one try is the first to see.
+    # The edges of all windows cut the plane into cells; each cell is first seen by one of the
+    # tries.
     middles, chances = zip(
         *(_cut(places[:, k], room[:, k], sigma[:, k]) for k in (0, 1)), strict=True
     )
@@ -67,7 +68,7 @@ def chance_by_try(
 
 
 def _cut(places: FloatArray, room: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the midpoints between window edges along an axis, and their probabilities, (N, C)."""
+    """Return the midpoints of the cells along an axis, and the cell probabilities, (N, C)."""
     lines = np.unique(places)
     edges = np.sort(np.concatenate([lines - room[:, None], lines + room[:, None]], axis=1), axis=1)
     chance = 0.5 * np.diff(erf(edges / (np.sqrt(2.0) * sigma[:, None])), axis=1)
@@ -77,7 +78,7 @@ def _cut(places: FloatArray, room: FloatArray, sigma: FloatArray) -> tuple[Float
 def search_places(target: Target, count: int) -> FloatArray:
     """Return the search points for a beam that earlier attempts missed, right and up, m, (K, 2).
 
-    The search starts at the middle and continues around it.
+    The search starts at the middle of the target and continues around it.
     """
     reach = int(np.ceil(np.sqrt(count)))
     line = np.arange(-reach, reach + 1)

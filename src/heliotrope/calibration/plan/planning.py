@@ -1,4 +1,4 @@
-"""Plans the sightings of one heliostat: the most informative sun positions and targets.
+"""Plan the sightings of one heliostat: the most informative sun positions and targets.
 
 A camera-target sighting adds JᵀJ to the information on the parameters, with J the whitened
 derivative of normal minus bisector. The *D-optimal* choice maximises the determinant of the
@@ -25,7 +25,7 @@ from heliotrope.mechanism.tracking import track
 from heliotrope.sun import Site, Times
 
 Criterion = Literal["d", "v"]
-#: Maximum number of exchange rounds; two or three are usual.
+#: Maximum number of exchange rounds; usually two or three are needed.
 SWEEPS = 50
 
 
@@ -77,7 +77,8 @@ class CandidateSightings:
     normal
         Mirror normals, ENU, (M, 3).
     incidence, obliquity
-        Angle between sun and mirror normal, and between beam and target normal, rad, (M,).
+        Angle between the sun and the mirror normal, and between the beam and the target normal,
+        rad, (M,).
     jacobian
         Whitened derivative of normal minus bisector with respect to the parameters, (M, 2, P).
     """
@@ -146,7 +147,8 @@ def aim_at(
     Parameters
     ----------
     mechanism, sun
-        Batch shapes broadcast; unit vectors ENU, (..., 3). The elevation of the sun is not checked.
+        Mechanisms, and unit vectors to the sun, ENU, (..., 3); their batch shapes broadcast. The
+        elevation of the sun is not checked.
     target, limits
         The target, and the limits that decide `Aimed.able`.
     current
@@ -177,7 +179,7 @@ def candidate_sightings(
     sigma: npt.ArrayLike = 5e-4,
     limits: SightingLimits | None = None,
 ) -> CandidateSightings:
-    """Return all sightings that sun position, targets and stops allow.
+    """Return all sightings that the sun position, the targets and the stops allow.
 
     Parameters
     ----------
@@ -188,7 +190,7 @@ def candidate_sightings(
     targets
         Targets with cameras; beams are sent to their centres.
     times
-        T times, see `heliotrope.sun.Times`; `time_grid` creates them.
+        T times; see `heliotrope.sun.Times`. `time_grid` creates them.
     names
         P parameters of the table.
     sigma
@@ -198,7 +200,7 @@ def candidate_sightings(
 
     Returns
     -------
-    Sorted by heliostat, then target, then time; may be empty.
+    Candidates sorted by heliostat, then by target, then by time; there may be none.
 
     Raises
     ------
@@ -252,7 +254,7 @@ def _part(
     sigma: FloatArray,
     limits: SightingLimits,
 ) -> tuple[np.ndarray, ...]:
-    """The arrays of `CandidateSightings` for some heliostats and one target."""
+    """Return the arrays of `CandidateSightings` for some heliostats and one target."""
     some = mechanism[first:last]
     aimed = aim_at(some, suns[:, None], target, limits)
     row, which = np.nonzero(aimed.able.T)
@@ -339,7 +341,8 @@ class SightingPlan:
     error
         Expected RMS beam error after each sighting, rad, (K,).
     best_first
-        The same if the sightings are made in order of rank, rad, (K,).
+        Expected RMS beam error after each sighting if sightings are made in order of rank, rad,
+        (K,).
     covariance
         Covariance of the parameters after all sightings, (P, P).
     """
@@ -378,13 +381,13 @@ def plan_sightings(
     candidates
         Candidates of the heliostat, (M,).
     count
-        Number of sightings; fewer if there are not enough candidates.
+        Number of sightings to choose; fewer are chosen if there are not enough candidates.
     information
         Information matrix of the parameters so far, (P, P); see `precision`.
     form
         Quadratic form of the squared beam error, (P, P); see `error_form`.
     criterion
-        "d": largest determinant of the information; "v": smallest expected squared
+        "d" for the largest determinant of the information, or "v" for the smallest expected squared
         beam error.
     exchange
         Whether to improve the greedy choice by exchanging one sighting at a time.
@@ -399,7 +402,8 @@ def plan_sightings(
     Notes
     -----
     The increase in log det is submodular, so the greedy choice reaches at least 63 % of the largest
-    possible increase (Nemhauser et al. 1978); with exchange the tests find 98 % or more.
+    possible increase (Nemhauser et al. 1978); in the tests, the choice after exchange reaches 98 %
+    or more.
     """
     if criterion not in ("d", "v"):
         raise InputError(
@@ -454,7 +458,7 @@ class _Choice:
         return _gain.variance_gain(covariance, self.slope[rows], self.weights)
 
     def greedy(self, count: int, rows: npt.NDArray[np.intp], apart: bool = True) -> list[int]:
-        """Rows of the best sightings, best first."""
+        """Return the indices of the best sightings, the best first."""
         covariance, chosen = as_float(np.linalg.inv(self.known)), list[int]()
         free = np.ones(len(rows), dtype=np.bool_)
         while len(chosen) < count and free.any():
@@ -469,7 +473,7 @@ class _Choice:
         return chosen
 
     def exchange(self, chosen: list[int]) -> list[int]:
-        """Replace one sighting at a time by a better one until there is none."""
+        """Replace one sighting at a time by a better sighting until there is none."""
         rows, everything = list(chosen), np.arange(len(self.time))
         total = self.known + sum(self.slope[r].T @ self.slope[r] for r in rows)
         for _ in range(SWEEPS):
@@ -488,7 +492,7 @@ class _Choice:
         return rows
 
     def walk(self, rows: list[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Gain and expected error after each of ``rows``, and the final covariance."""
+        """Return the gain and expected error after each of ``rows``, and the final covariance."""
         covariance = as_float(np.linalg.inv(self.known))
         gain, error = np.empty(len(rows)), np.empty(len(rows))
         for k, row in enumerate(rows):

@@ -11,21 +11,23 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 
-#: Time of a movement or a frame excluding settling, s: 128 photographs took 254 s.
+#: Time of a movement or a frame, excluding the time to settle, s; 128 photographs took 254 s.
 _PHOTOGRAPH = 1.0
-#: Time excluding photographs and new parameters, s: sun checks, the return to the aim, the
-#: separation.
+#: Time of a visit excluding photographs and new parameters, s. It covers sun checks, the return to
+#: the aim, and the separation of the beams.
 _BESIDE = 15.0
-#: Time for which a mirror leaves the receiver for new parameters, s: 47, one by one, took 9.5 min.
+#: Time for which a heliostat leaves the receiver to receive new parameters, s; 47 heliostats, one
+#: by one, took 9.5 min.
 _AWAY = 12.0
-#: Fraction of its own power that a heliostat's movements cost, per rad²: 50 of 150 cost 0.44 % with
-#: movements of 1 mrad.
+#: Fraction of its power that a heliostat loses by its movements, per rad². Movements of 1 mrad by
+#: 50 of 150 heliostats cost 0.44 %.
 _COST = 0.0044 * 150 / 50 / 1e-3**2
-#: Standard deviation of a centroid by a whole stack, rad.
+#: Standard deviation of a centroid found from a whole stack, rad.
 _CENTROID = 1e-4
-#: Share of the largest expected error that automatic control allows.
+#: Largest expected error of a participant, as a fraction of the largest that automatic control
+#: allows.
 _SURE = 0.75
-#: Fewest photographs of a stack.
+#: Minimum number of photographs in a stack.
 _FEWEST = 8
 #: The four ends of a movement along both axes.
 _ENDS = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)])
@@ -45,7 +47,7 @@ class ReceiverTerms:
         Standard deviation of a beam position from all photographs of a stack, per direction, rad;
         measured in the simulated plant: 0.32 mrad RMS in both directions together.
     pace
-        Duration of a visit as a fraction of that in the simulated plant.
+        Duration of a visit divided by its duration in the simulated plant.
     """
 
     settings: ReceiverSettings
@@ -89,18 +91,21 @@ class ReceiverTerms:
         return min(self.settings.most, int(self.settings.power * shining / cost))
 
     def photographs(self, mirrors: int) -> int:
-        """Return the number of photographs in a visit: each heliostat has its own code per axis."""
+        """Return the number of photographs in a visit.
+
+        Each heliostat has its own code per axis.
+        """
         return max(_FEWEST, 1 << (2 * mirrors).bit_length())
 
     def span(self, mirrors: int, shining: int) -> float:
-        """Return the time of a visit, s, until all heliostats have the parameters that it produced.
+        """Return the time of a visit, s, until all heliostats have their new parameters.
 
         Parameters
         ----------
         mirrors, shining
-            Number of heliostats that take part, and of those on the receiver. As in the plant, only
-            a fraction of the latter, but at least one heliostat, is away for new parameters at a
-            time.
+            Number of heliostats that take part, and number of heliostats on the receiver. As in the
+            plant, only a fraction of the heliostats on the receiver, but at least one, is away for
+            new parameters at any time.
         """
         settings = self.settings
         step = settings.settle + settings.exposures * _PHOTOGRAPH
@@ -108,7 +113,7 @@ class ReceiverTerms:
         return self.pace * (_BESIDE + step * self.photographs(mirrors) + _AWAY * turns)
 
     def shining(self, position: FloatArray, aim: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return the mask of heliostats that stay on the receiver throughout their movements, (N,).
+        """Return a mask of heliostats that stay on the receiver throughout their movements, (N,).
 
         Parameters
         ----------

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Okabe and Ito's colours, told apart by the colour-blind too.
+#: Okabe and Ito's colours, which colour-blind readers can distinguish.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 _PICTURES = (".png", ".svg", ".pdf")
 
@@ -75,7 +75,7 @@ def campaign_rows(
 def plans_document(
     plans: Mapping[str, SightingPlan], fleets: Sequence[Fleet], targets: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the plans of some heliostats for JSON."""
+    """Return the plans of some heliostats as a JSON object."""
     return {
         **_head(fleets, targets),
         "heliostats": {
@@ -92,7 +92,7 @@ def plans_document(
 def campaign_document(
     campaign: CalibrationCampaign, fleets: Sequence[Fleet], targets: Sequence[str]
 ) -> dict[str, Any]:
-    """Return a campaign for JSON."""
+    """Return a campaign as a JSON object."""
     labels = [name for fleet in fleets for name in fleet.labels]
     return {
         **_head(fleets, targets),
@@ -123,7 +123,7 @@ def iso(seconds: float) -> str:
 
 
 def write_table(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write records as CSV, whole or not at all, with their keys as the header.
+    """Write records as CSV, completely or not at all, with their keys as the header.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def write_table(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def write_picture(path: str | Path, figure: "Figure") -> None:
-    """Write a picture as PNG, SVG or PDF by its suffix, whole or not at all.
+    """Write a picture as PNG, SVG or PDF, as its suffix says, completely or not at all.
 
     Raises
     ------
@@ -161,7 +161,7 @@ def check_picture(path: str | Path) -> str:
     Raises
     ------
     InputError
-        If it is not .png, .svg or .pdf.
+        If the suffix is not .png, .svg or .pdf.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in _PICTURES:
@@ -177,9 +177,9 @@ def plan_picture(plans: Mapping[str, SightingPlan], possible: CandidateSightings
     Parameters
     ----------
     plans
-        Plans by name of the heliostat.
+        Plans, by heliostat name.
     possible
-        Candidates; their suns are drawn as small dots.
+        Candidates; their sun positions are drawn as small dots.
     """
     from matplotlib.figure import Figure
 
@@ -233,7 +233,7 @@ def _sun_paths(ax: "Axes", possible: CandidateSightings, centre: float) -> None:
 
 
 def _ranks(ax: "Axes", azimuth: FloatArray, elevation: FloatArray, plan: SightingPlan) -> None:
-    """Write ranks beside the points, one text for points close together."""
+    """Write ranks beside the points, with a single label for points that are close together."""
     remaining = list(range(len(plan)))
     while remaining:
         first = remaining[0]
@@ -256,7 +256,7 @@ def _ranks(ax: "Axes", azimuth: FloatArray, elevation: FloatArray, plan: Sightin
 def campaign_picture(
     campaign: CalibrationCampaign, position: FloatArray, targets: Sequence[str]
 ) -> "Figure":
-    """Return a map of the field by expected error after the campaign, and the error over time.
+    """Return a map of the expected errors after the campaign, and a plot of the error over time.
 
     Parameters
     ----------
@@ -307,11 +307,11 @@ def _finish(axes: "Sequence[Axes]", legend: bool) -> None:
 
 
 def _centre(suns: FloatArray) -> float:
-    """Azimuth of the mean sun, °."""
+    """Return the azimuth of the mean sun position, °."""
     return float(np.degrees(azimuth_elevation(suns.sum(axis=0))[0]))
 
 
 def _place(suns: FloatArray, centre: float) -> tuple[FloatArray, FloatArray]:
-    """Azimuth within half a turn of ``centre``, so that no path breaks at north; elevation."""
+    """Return azimuths within half a turn of ``centre``, and elevations, both in degrees."""
     azimuth, elevation = np.degrees(azimuth_elevation(suns))
     return np.asarray((azimuth - centre + 180.0) % 360.0 - 180.0 + centre), elevation

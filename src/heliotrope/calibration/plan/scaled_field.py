@@ -1,7 +1,8 @@
-"""Knowledge of all heliostats in a plan, and what a target visit would add at one sun position.
+"""What is known of all heliostats in a plan, and what a target visit would add at one sun position.
 
-Heliostats are numbered consecutively over all fleets. Parameters are scaled by their present
-standard deviations, so that metres and radians have equal weight, and padded to the largest model.
+Heliostats are numbered consecutively over all fleets. Parameters are scaled by their current
+standard deviations, so that metres and radians have equal weight, and padded to the number of the
+largest model.
 """
 
 from collections.abc import Sequence
@@ -28,11 +29,11 @@ class TargetView:
     Attributes
     ----------
     able
-        Within stops and limits, (N,).
+        Whether each pose is within the stops and limits, (N,).
     slope
-        Whitened derivative by the scaled parameters, (N, 2, P).
+        Whitened derivative with respect to the scaled parameters, (N, 2, P).
     seconds
-        Time of the drives from the aim to the target, s, (N,).
+        Slew time from the aim to the target, s, (N,).
     counts
         Drive counts, (N, D).
     """
@@ -49,7 +50,7 @@ class ScaledField:
     Attributes
     ----------
     fleets, offsets
-        The fleets, and the number of the first heliostat of each.
+        The fleets, and the index of each fleet's first heliostat.
     covariance, form
         Covariance of the scaled parameters, and form of the squared beam error, (N, P, P).
     counted
@@ -85,7 +86,7 @@ class ScaledField:
         return len(self.covariance)
 
     def squares(self, rows: npt.NDArray[np.intp] | slice = slice(None)) -> FloatArray:
-        """Return the expected squared beam error of heliostats (all), rad², (K,)."""
+        """Return the expected squared beam error of ``rows`` (default: all), rad², (K,)."""
         return np.asarray(np.einsum("npq,nqp->n", self.form[rows], self.covariance[rows]))
 
     def part(self, k: int, rows: slice, sun: FloatArray, target: Target) -> TargetView:
@@ -113,13 +114,13 @@ class ScaledField:
         return TargetView(able, slope * self._scale[mine, None], seconds, aimed.counts)
 
     def single(self, i: int, sun: FloatArray, target: Target) -> TargetView:
-        """Return heliostat ``i`` alone, (1,)."""
+        """Return the view of heliostat ``i`` alone, (1,), aimed at a target."""
         k = int(np.searchsorted(self.offsets, i, side="right")) - 1
         row = i - int(self.offsets[k])
         return self.part(k, slice(row, row + 1), sun, target)
 
     def view(self, sun: FloatArray, target: Target) -> TargetView:
-        """Return all heliostats, fleet after fleet."""
+        """Return the view of all heliostats aimed at a target, fleet after fleet."""
         parts = [
             self.part(k, slice(a, min(a + CHUNK, len(fleet))), sun, target)
             for k, fleet in enumerate(self.fleets)

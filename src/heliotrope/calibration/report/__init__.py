@@ -1,7 +1,7 @@
-"""Reports a calibration: a page with its plots, and files for other programs.
+"""Report a calibration: a page with plots, and files for other programs.
 
 A `CalibrationReport` holds the content; `write_report` writes the page and all files beside it.
-`FieldParameters` are the parameters at one moment as stored in ``calibration.json``: `read_json`
+`FieldParameters` are the parameters at one moment, as stored in ``calibration.json``. `read_json`
 reads them, and `Plant.with_calibration` applies them to a plant.
 """
 

@@ -22,7 +22,7 @@ from heliotrope.mechanism.parameters import MODELS
 
 @dataclass(frozen=True)
 class HeliostatRow:
-    """Beam errors of one heliostat, rad: before, after, and for the held-out sightings."""
+    """Beam errors of one heliostat, rad: before and after calibration, and held out."""
 
     index: int
     name: str
@@ -42,11 +42,12 @@ class CalibrationReport:
     names
         Names of the N heliostats.
     learned
-        Learnt from all sightings.
+        The field, learnt from all sightings.
     plant, group
         The plant, and the name of the group of these heliostats.
     assessment
-        Results of a second learning run with part of the sightings held out, or None.
+        Results of a second learning run with part of the sightings held out; None if there was no
+        second run.
     ids
         Name of each sighting, for the list of outliers.
     left_out
@@ -84,7 +85,7 @@ class CalibrationReport:
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
-        """Notes on the clock, contradictions, heliostats that do not fit or were not learnt.
+        """Notes on the clock, contradictions, and heliostats that do not fit or were not learnt.
 
         Notes that call the result into question come first.
         """
@@ -102,17 +103,17 @@ class CalibrationReport:
 
     @cached_property
     def before(self) -> BeamErrors:
-        """Errors under the nominal mechanisms."""
+        """Errors with the nominal mechanisms."""
         return beam_errors(self.learned.mechanism, self.learned.sightings)
 
     @cached_property
     def after(self) -> FloatArray:
-        """Beam error of each sighting, predicted from the others, rad right and up, (M, 2)."""
+        """Error of each beam predicted from the other sightings, rad right and up, (M, 2)."""
         return left_out_errors(self.learned)
 
     @cached_property
     def distance(self) -> FloatArray:
-        """From mirror to destination, m; 1 if the destination is at infinity, (M,)."""
+        """Distance from mirror to destination, m; 1 if the destination is at infinity, (M,)."""
         s = self.learned.sightings
         path = s.destination - self.learned.mechanism[s.heliostat].pose(s.counts).vertex
         return np.where(s.destination_at_infinity, 1.0, np.linalg.norm(path, axis=-1))
@@ -161,10 +162,10 @@ class CalibrationReport:
 
     @cached_property
     def guo(self) -> dict[str, dict[str, float]] | None:
-        """Guo's six parameters of each heliostat with sightings, degrees; None for other models.
+        """Guo's six parameters per heliostat with sightings, degrees; None for other models.
 
-        They describe the complete mechanism, in the ranges of `regularise`; parameters that only
-        drift (`canting_secondary`) are not included.
+        The six parameters describe the complete mechanism, in the ranges of `regularise`.
+        Parameters that only drift (`canting_secondary`) are not included.
         """
         r = self.results
         if not set(r.model) <= set(MODELS["guo6"]) or not r.learnt.any():
@@ -185,7 +186,7 @@ class CalibrationReport:
         }
 
     def document(self) -> dict[str, Any]:
-        """Return the results for JSON."""
+        """Return the results as a JSON object."""
         results = self.results
         tested = {h.name: h for h in self.assessment.heliostats} if self.assessment else {}
         heliostats = {

@@ -1,4 +1,4 @@
-"""Writes a calibration report: one page with its plots, and files beside it."""
+"""Write a calibration report: one page with its plots, and files beside it."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +22,7 @@ MOST_SECTIONS = 60
 def write_parameters(report: CalibrationReport, path: Path) -> None:
     """Write the parameters and their standard deviations as CSV, one record per heliostat.
 
-    Column names carry the unit: ``tilt_north_rad``, ``tilt_north_sigma_rad``.
+    Column names include the unit, as in ``tilt_north_rad`` and ``tilt_north_sigma_rad``.
     """
     r, c = report.results, report.learned.static
     header = ["name", "sightings", "outcome", "noise_scale"]
@@ -48,10 +48,11 @@ def write_report(
     *,
     most: int = MOST_SECTIONS,
 ) -> Path:
-    """Write the page and the files beside it; returns the path of the page.
+    """Write the page and the files beside it, and return the path of the page.
 
-    ``index.html`` (with all plots embedded), ``parameters.csv``, ``calibration.json``,
-    ``calibration.parquet``, and ``plant.toml`` with the calibrated heliostats.
+    The files are ``index.html`` (with all plots embedded), ``parameters.csv``,
+    ``calibration.json``, ``calibration.parquet``, and ``plant.toml`` with the calibrated
+    heliostats.
 
     Parameters
     ----------
@@ -62,7 +63,7 @@ def write_report(
     progress
         Called with the numbers of plots (done, total) after each plot.
     most
-        Maximum number of heliostats with their own plots: those with the largest errors.
+        Maximum number of heliostats that get their own plots; the largest errors come first.
     """
     folder.mkdir(parents=True, exist_ok=True)
     learned, r = report.learned, report.results
@@ -148,7 +149,7 @@ def _notes(report: CalibrationReport, i: int) -> list[str]:
 
 
 def _parameters(report: CalibrationReport, i: int) -> list[dict[str, Any]]:
-    """Rows of the table of parameters, in mrad, mm or ‰."""
+    """Return the rows of the parameter table, in mrad, mm or ‰."""
     r = report.results
     rows = []
     for p, name in enumerate(r.names):

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Grey, blue, orange and vermilion of Okabe and Ito, told apart by the colour-blind too.
+#: Okabe and Ito's grey, blue, orange and vermilion, which colour-blind readers can distinguish.
 BEFORE, AFTER, TESTED, OUTLIER = "#999999", "#0072b2", "#e69f00", "#d55e00"
 #: Width and height of the picture of one heliostat, inches.
 SIZE = (13.0, 11.0)
@@ -26,7 +26,7 @@ REGIMES = ("#0072b2", "#009e73", "#cc79a7", "#56b4e9", "#f0e442")
 def figure_of(
     rows: int, columns: int, size: tuple[float, float], *, fitted: bool = True
 ) -> tuple["Figure", Any]:
-    """Return a figure that needs no display, and its axes, ``fitted`` to their labels."""
+    """Return a figure that needs no display, and its axes; ``fitted`` makes room for labels."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -80,8 +80,8 @@ def field_map(result: CalibrationReport) -> "Figure":
 
 def heliostat_figure(result: CalibrationReport, i: int) -> "Figure":
     """Return a picture of one heliostat: target, residuals, parameters, the year."""
-    # Places in figures: to fit them to its labels, matplotlib draws a picture twice more, which
-    # took two thirds of the time of a report.
+    # Panel positions are fixed. To fit them to the labels, matplotlib would draw a picture twice
+    # more, which took two thirds of the time of a report.
     figure, axes = figure_of(3, 3, SIZE, fitted=False)
     figure.subplots_adjust(0.055, 0.045, 0.985, 0.93, wspace=0.25, hspace=0.27)
     mine = np.flatnonzero(result.learned.sightings.heliostat == i)
@@ -165,7 +165,7 @@ def _parameters(ax: "Axes", result: CalibrationReport, i: int) -> None:
         r.values[i] / priors, rows, xerr=r.sigma[i] / priors, fmt="o", color=AFTER, ms=4, capsize=2
     )
     ax.set_yticks(rows, r.names, fontsize=7)
-    # The names need more room than the figures of the other panels: 4.4 points a letter.
+    # Names need more room than the numbers in the other panels: 4.4 points per letter.
     place = ax.get_position()
     room = 4.4 / 72.0 / SIZE[0] * max(map(len, r.names), default=0)
     margin = max(0.0, room - 0.04)

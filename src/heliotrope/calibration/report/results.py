@@ -2,7 +2,8 @@
 
 For each heliostat the JSON file contains the parameters with their covariance at one moment,
 regimes, steps and outliers; it also contains the hyperparameters of the field. The Parquet table
-has one record per heliostat. The plant file is the given plant with the calibrated parameters.
+has one record per heliostat. The plant file is that of the input plant, with the calibrated
+parameters added.
 """
 
 import json
@@ -46,19 +47,19 @@ class FieldParameters:
     heliostats
         Names, (N,).
     time
-        The moment, Unix seconds; NaN: unknown.
+        Time of that moment, Unix seconds; NaN if unknown.
     values, covariance
-        Deviations (N, P) and their covariance (N, P, P), rad, m or 1.
+        Deviations, (N, P), and their covariance, (N, P, P); the units are rad, m or 1.
     noise
-        Noise of a sighting, in units of the sighting's sigma, (N,).
+        Noise of a sighting, in units of its stated sigma, (N,).
     used
         Number of sightings used, (N,).
     learnt
         Whether the parameters come from the heliostat's own sightings, (N,). All other heliostats
-        get only the part that the field shares.
+        receive only the part that is common to the field.
     shared
-        Whether enough heliostats support the shared part of a parameter, (P,); where not, the value
-        is 0 for a heliostat that was not learnt.
+        Whether enough heliostats support the common part of a parameter, (P,). If not, its value is
+        0 for a heliostat that was not learnt.
     """
 
     model: tuple[str, ...]
@@ -73,7 +74,7 @@ class FieldParameters:
     shared: npt.NDArray[np.bool_]
 
     def only(self, rows: npt.NDArray[np.bool_]) -> "FieldParameters":
-        """Return the parameters of some heliostats, by a mask, (N,)."""
+        """Return the parameters of the heliostats selected by a mask, (N,)."""
         return replace(
             self,
             heliostats=tuple(n for n, kept in zip(self.heliostats, rows, strict=True) if kept),
@@ -83,8 +84,8 @@ class FieldParameters:
     def applied_to(self, plant: Plant) -> tuple[Plant, tuple[str, ...]]:
         """Return the plant with these parameters, and notes on the heliostats that were not learnt.
 
-        Heliostats that were not learnt keep their own parameters. If a heliostat has none, it gets
-        the part that the field shares, where enough heliostats support it.
+        Heliostats that were not learnt keep their own parameters. A heliostat that has no
+        parameters receives the part that is common to the field, if enough heliostats support it.
         """
         own = np.zeros(len(self.heliostats), np.bool_)
         for i, name in enumerate(self.heliostats):
@@ -111,7 +112,7 @@ class FieldParameters:
 
     @property
     def parameters(self) -> dict[str, FloatArray]:
-        """Values by name, each (N,), as `Mechanism.with_calibration` takes them."""
+        """Values by name, each (N,), in the form that `Mechanism.with_calibration` accepts."""
         return {name: self.values[:, p] for p, name in enumerate(self.names)}
 
     @property
@@ -120,16 +121,16 @@ class FieldParameters:
         return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
 
 
-#: The arrays with one row for each heliostat.
+#: The arrays that have one row per heliostat.
 _BY_HELIOSTAT = ("values", "covariance", "noise", "used", "learnt")
-#: The field shares a part of a parameter that is this many standard deviations from 0.
+#: A parameter has a common part if that part is this many standard deviations from 0.
 SUPPORTED = 3.0
 
 
 def at_moment(
     names: tuple[str, ...], learned: Learned, time: float | None = None
 ) -> FieldParameters:
-    """Return the parameters at Unix ``time``; default: the time of the last sighting used."""
+    """Return the parameters at Unix ``time``; default: the time of the last used sighting."""
     known = learned.sightings.time[learned.used & np.isfinite(learned.sightings.time)]
     when = float(known.max()) if time is None and len(known) else np.nan
     if time is not None:
@@ -253,7 +254,7 @@ def read_json(path: str | Path) -> FieldParameters:
     Raises
     ------
     FormatError
-        If it is not such a file; the message says what is wrong and where.
+        If the file was not written by `write_json`; the message says what is wrong and where.
     """
     root = _json.read_json(path, "a calibration")
     if not root.has("kind") or root["kind"].text() != KIND:
@@ -343,7 +344,7 @@ def write_paint(
 
     Returns
     -------
-    By heliostat, the parameters that the format cannot hold, with their values.
+    For each heliostat, the parameters that the format cannot hold, with their values.
 
     Raises
     ------
@@ -394,7 +395,7 @@ def write_artist(
 
     Returns
     -------
-    By heliostat, the parameters that the format cannot hold, with their values.
+    For each heliostat, the parameters that the format cannot hold, with their values.
 
     Raises
     ------
@@ -429,7 +430,7 @@ def write_opencsp(
 
     Returns
     -------
-    By heliostat, the parameters that the table cannot hold: all but the position.
+    For each heliostat, the parameters that the table cannot hold: all except the position.
 
     Raises
     ------
@@ -457,7 +458,7 @@ def write_solarpilot(
 
     Returns
     -------
-    By heliostat, the parameters that the layout cannot hold: all but the position.
+    For each heliostat, the parameters that the layout cannot hold: all except the position.
 
     Raises
     ------
@@ -482,7 +483,7 @@ def _moved(
     location: FloatArray,
     source: str | Path,
 ) -> tuple[FloatArray, dict[str, tuple[str, ...]]]:
-    """Return the learnt locations (N, 3), and the parameters lost in this format, by name."""
+    """Return the learnt locations (N, 3), and the parameters that are lost, by heliostat."""
     rows, moved = {name: i for i, name in enumerate(names)}, location.copy()
     lost: dict[str, tuple[str, ...]] = {}
     for name in heliostats:
@@ -504,7 +505,7 @@ def _moved(
 
 
 def _calibrated(plant: Plant, learned: Learned, time: float | None, what: str) -> Plant:
-    """Return the plant with the learnt parameters, for ``what`` to write."""
+    """Return the plant with the learnt parameters; ``what`` names the format in errors."""
     if not learned.heliostats:
         raise InputError(
             f"{what}: learnt without heliostat names; learn from the plant, or plant[name]"

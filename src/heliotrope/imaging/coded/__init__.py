@@ -1,8 +1,8 @@
 """Several beams on one target at once, identified by small coded movements.
 
-- `codes`: the movements, orthogonal and zero-mean.
+- `codes`: orthogonal, zero-mean movements.
 - `stack`: photographs of one surface and the light in each photograph.
-- `beams`: expected beams and the beams found, each with a verdict.
+- `beams`: expected beams, and found beams, each with a verdict.
 - `separation`: from a stack and its codes to the beam of each heliostat.
 """
 

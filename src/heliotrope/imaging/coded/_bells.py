@@ -4,13 +4,13 @@ import numpy as np
 
 from heliotrope.geometry import FloatArray
 
-#: The third derivatives of a Gaussian that the movements' Jacobian needs: axis of the movement,
-#: then the two axes of a second moment.
+#: Third derivatives of a Gaussian needed for the Jacobian of movements. The axis of the movement is
+#: followed by the two axes of a second moment.
 _MOMENTS = ((0, 0), (0, 1), (1, 1))
 
 
 def bell(points: FloatArray, place: FloatArray, moments: FloatArray) -> FloatArray:
-    """Return a Gaussian of power 1 at points (N, 2), (N,), 1/m²."""
+    """Return the values, 1/m², (N,), of a Gaussian with power 1 at points (N, 2)."""
     q = np.linalg.inv(moments)
     d = points - place
     form = q[0, 0] * d[:, 0] ** 2 + 2.0 * q[0, 1] * d[:, 0] * d[:, 1] + q[1, 1] * d[:, 1] ** 2
@@ -18,7 +18,7 @@ def bell(points: FloatArray, place: FloatArray, moments: FloatArray) -> FloatArr
 
 
 def slopes(points: FloatArray, place: FloatArray, moments: FloatArray) -> FloatArray:
-    """Return the change of a Gaussian of power 1 per movement along each axis, (2, N)."""
+    """Return the change of a Gaussian with power 1 per metre moved along each axis, (2, N)."""
     s = (points - place) @ np.linalg.inv(moments)
     return np.asarray(s.T * bell(points, place, moments))
 
@@ -50,7 +50,7 @@ def moved(
 ) -> FloatArray:
     """Return a Gaussian of power 1 at K positions minus the same Gaussian at rest, (K, N).
 
-    Codes take few values, so equal movements are computed only once.
+    A code has few different values, so equal movements are computed only once.
     """
     distinct, which = np.unique(moves, axis=0, return_inverse=True)
     rest = bell(points, place, moments)

@@ -1,4 +1,4 @@
-"""Fits beams to the pictures that their movements produce."""
+"""Fit beams to the pictures that their movements produce."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,14 +14,15 @@ from heliotrope.imaging.coded.stack import Light, Stack, light_of
 
 #: Minimum significance of a movement.
 SIGNIFICANT = 8.0
-#: Codes that lost photographs must keep this share of their independence.
+#: If photographs are missing, the codes must keep at least this fraction of their independence.
 _INDEPENDENT = 0.02
-#: Window of the fit, in standard deviations of the beam.
+#: Half-width of the fit window, in standard deviations of the beam.
 _WINDOW = 3.5
-#: Standard deviation of the difference between the centroid of a beam and that of its Gaussian, in
-#: the beam's radius; canted facets of 6 m² at 80 to 200 m.
+#: Standard deviation of the difference between the centroid of a beam and that of its Gaussian, as
+#: a fraction of the beam radius, for canted facets of 6 m² at 80 to 200 m.
 _LOPSIDED = 0.04
-#: A beam's moments change by at most this factor in a step, and its width in all.
+#: The second moments of a beam change by at most the first factor per step, and by the second
+#: overall.
 _CHANGE, _WIDEST = 1.5, 4.0
 _STEPS = 6
 
@@ -43,8 +44,8 @@ class Fit:
     power_sigma
         Standard deviation of ``power``.
     shown
-        Whether the surface shows the beam's position; False if the beam lies more than its radius
-        off the surface, so that only a tail was fitted.
+        Whether the surface shows the beam's position; False if the beam lies off the surface by
+        more than its radius, so that only a tail was fitted.
     """
 
     power: float
@@ -56,7 +57,7 @@ class Fit:
 
     @property
     def radius(self) -> float:
-        """Radius of the beam: standard deviation of its light over both axes, m."""
+        """Radius of the beam, m: the standard deviation of its light over both axes."""
         return float(np.sqrt(0.5 * np.trace(self.moments)))
 
 
@@ -67,11 +68,11 @@ class Fitted:
     Attributes
     ----------
     fits
-        One fit per heliostat, M; None if nothing follows the code.
+        One fit for each of M heliostats; None if no light follows the code.
     light
         Light of the photographs.
     mean
-        Mean picture, as if no beam moved, (N,).
+        Mean picture, as it would be if no beam moved, (N,).
     """
 
     fits: tuple[Fit | None, ...]
@@ -80,12 +81,12 @@ class Fitted:
 
 
 def axes_of(moves: FloatArray) -> npt.NDArray[np.intp]:
-    """Return the axes (A of them, one or two) along which heliostats move, for moves (K, M, 2)."""
+    """Return the A axes (one or two) along which heliostats move, for moves (K, M, 2)."""
     return np.flatnonzero(np.any(moves != 0.0, axis=(0, 1)))
 
 
 def code_of(moves: FloatArray) -> npt.NDArray[np.intp]:
-    """Return for each heliostat the first one with the same code, (M,), for moves (K, M, 2).
+    """Return, for each heliostat, the first heliostat with the same code, (M,).
 
     Heliostats share a code if their movements are proportional, with one positive factor per axis.
     """
@@ -97,11 +98,11 @@ def code_of(moves: FloatArray) -> npt.NDArray[np.intp]:
 
 
 def regression(moves: FloatArray, weights: FloatArray) -> FloatArray | None:
-    """Return the rows (A M, K) that turn pixels' series into changes per metre of movement.
+    """Return the rows (A M, K) that convert pixel series to changes per metre of movement.
 
     A is the number of axes along which heliostats move. Heliostats that share a code change in the
-    same way, apart from the size of their movements. None if different codes are linearly dependent
-    over the photographs used.
+    same way, apart from the size of their movements. The result is None if different codes are
+    linearly dependent over the photographs used.
     """
     if not moves.any():
         return None
@@ -116,7 +117,8 @@ def regression(moves: FloatArray, weights: FloatArray) -> FloatArray | None:
         return None
     if np.linalg.eigvalsh(normal / np.outer(size, size))[0] < _INDEPENDENT:
         return None
-    # Against the weighted mean, which the regression takes away from the series, too.
+    # Movements are relative to the weighted mean, which the regression also subtracts from the
+    # series.
     rows = np.linalg.solve(normal, codes.T * weights)
     rows = rows - rows.sum(axis=1, keepdims=True) * weights / weights.sum()
     lengths = np.sqrt((moves**2).sum(axis=0))
@@ -134,7 +136,7 @@ def fitted(
 ) -> Fitted:
     """Fit the beams of a stack by Gauss-Newton iteration.
 
-    The residual is exact: it is what the photographs show beyond beams that moved as commanded.
+    The residual is the exact difference between the photographs and beams that moved as commanded.
     Each beam is improved from its own pictures of that residual, one per axis of movement.
     """
     points = np.stack(np.meshgrid(*stack.axes), axis=-1)[stack.seen]
@@ -153,7 +155,7 @@ def fitted(
         light = light_of(values, empty, change)
         rows = regression(moves, light.weights)
         if rows is None:
-            # The light of a photograph near the limit has changed: nothing is proven.
+            # If the light of a photograph near the limit has changed, the result cannot be trusted.
             return Fitted((None,) * len(fits), light, light.mean)
         rest = light.pictures - change
         mean = light.weights @ rest / light.weights.sum()
@@ -178,7 +180,7 @@ def fitted(
 
 
 def _beside(points: FloatArray, place: FloatArray) -> FloatArray:
-    """Return how far a position lies beyond points (N, 2) along each axis, m, (2,); ≤ 0: not."""
+    """Return how far a position is outside points (N, 2) on each axis, m, (2,); ≤ 0 if inside."""
     return np.asarray(np.maximum(points.min(axis=0) - place, place - points.max(axis=0)))
 
 
@@ -190,7 +192,7 @@ def _window(points: FloatArray, fit: Fit) -> npt.NDArray[np.bool_]:
 def _improved(
     points: FloatArray, picture: FloatArray, fit: Fit, first: Fit, axes: npt.NDArray[np.intp]
 ) -> Fit:
-    """Return a fit improved by one bounded step."""
+    """Return the fit after one bounded improvement step."""
     if len(points) < 12:
         return fit
     terms = slope_derivatives(points, fit.place, fit.moments, fit.power)[:, axes].reshape(6, -1)
@@ -205,7 +207,7 @@ def _improved(
 
 
 def _bounded(moments: FloatArray, fit: Fit, first: Fit) -> FloatArray:
-    """Limit second moments to within a factor of the previous and of the initial moments."""
+    """Limit second moments to within a factor of their previous and their initial values."""
     for base, factor in ((fit.moments, _CHANGE**2), (first.moments, _WIDEST**2)):
         root = np.linalg.cholesky(base)
         inverse = np.linalg.inv(root)
@@ -223,13 +225,13 @@ def _measured(
     stack: Stack,
     axes: npt.NDArray[np.intp],
 ) -> Fit:
-    """Return a fit with its covariance, its position corrected by the residual.
+    """Return a fit with its covariance, and its position corrected by the residual.
 
     With x measured from the fitted position, ∫ x² Gₓ = ∫ 2 x y G_y = 2 p x̄ for any beam shape;
-    weights of 4 : 3 are best for the two in a round window with uniform noise. A single picture
-    yields only one of them. The correction is weighted according to its own noise, which is the
-    effect of each photograph's residual on the position: errors may be correlated between
-    neighbouring pixels, but not between photographs.
+    weights of 4 : 3 are best for the two integrals in a round window with uniform noise. A single
+    picture yields only one of the two integrals. The correction is weighted according to its own
+    noise, which is computed from the effect of each photograph's residual on the position. Errors
+    may therefore be correlated between neighbouring pixels, but not between photographs.
 
     Parameters
     ----------
@@ -240,7 +242,7 @@ def _measured(
     rows
         Regression on the mirror's codes, (A, K).
     axes
-        The A axes of its movement.
+        The A axes of the mirror's movement.
     """
     x, y = (points - fit.place).T
     square, cross = (2.0 / 7.0, 3.0 / 7.0) if len(axes) == 2 else (0.5, 1.0)
@@ -251,7 +253,7 @@ def _measured(
     flat = terms.reshape(6, -1)
     scale = np.maximum(np.sqrt((flat**2).sum(axis=1)), 1e-300)
     gauss = (np.linalg.pinv((flat / scale[:, None]).T) / scale[:, None]).reshape(terms.shape)
-    # The fit has taken its part of the moments already.
+    # The fit already accounts for its part of the moments.
     beyond = moments - np.einsum("ip,pan->ian", np.einsum("ian,pan->ip", moments, terms), gauss)
     picture = rows @ rest
     lopsided = (_LOPSIDED * fit.radius) ** 2
@@ -268,7 +270,7 @@ def _measured(
 
 
 def _covariance(levers: FloatArray, rest: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return the covariance of ∑ levers (I, A, N) times the pictures rows @ rest, (I, I)."""
+    """Return the covariance, (I, I), of ∑ levers (I, A, N) times the pictures ``rows @ rest``."""
     total = np.zeros((len(levers), len(levers)))
     for axis in range(len(rows)):
         effect = rest @ levers[:, axis].T

@@ -1,4 +1,4 @@
-"""Judges the beam of each heliostat from a stack."""
+"""Assess the beam of each heliostat in a stack."""
 
 from collections.abc import Sequence
 
@@ -10,22 +10,24 @@ from heliotrope.imaging.coded._still import StillLight
 from heliotrope.imaging.coded._tops import Top
 from heliotrope.imaging.coded.beams import ExpectedBeam, SeparatedBeam, Verdict
 
-#: A second top that moves by the same code, as a share of the first.
+#: A second peak that follows the same code counts if it reaches this fraction of the first peak.
 _SECOND = 0.45
-#: Square of the distance within which 99.9 % of a two-dimensional Gaussian lie.
+#: Squared distance within which 99.9 % of a two-dimensional Gaussian lie.
 _GATE = 2.0 * float(np.log(1000.0))
-#: A gain farther from 1 than this, and than this many σ, is wrong.
+#: A gain is wrong if it differs from 1 by more than this, and by more than this many σ.
 _GAIN, _GAIN_SIGMAS = 0.3, 3.0
-#: A mirror that does not move has this share of the usual beam at its expected place.
+#: A mirror that does not move has at least this fraction of the usual power at its expected
+#: position.
 _STANDS = 0.4
-#: A top with less than this share of the usual power is what another beam of its code leaves.
+#: A peak with less than this fraction of the usual power is the remainder of another beam with the
+#: same code.
 _WEAK = 0.25
-#: Error of powers by the shape of beams, relative.
+#: Relative error of powers due to the beam shape.
 _SHAPE = 0.05
 
 
 def lost(beam: ExpectedBeam, verdict: Verdict, power: float = 0.0) -> SeparatedBeam:
-    """Return a beam that was not found."""
+    """Return the record of a beam that was not found."""
     unknown = np.full((2, 2), np.nan)
     gain = 0.0 if verdict is Verdict.STUCK else float("nan")
     return SeparatedBeam(
@@ -44,9 +46,9 @@ def judged(
     Parameters
     ----------
     expected, tops, fits
-        M mirrors.
+        Expected beams, peaks and fits of M mirrors.
     still
-        Static light; None where other light hides it.
+        Static light; None if other light hides it.
     """
     usual = float(np.percentile([fit.power for fit in fits if fit is not None] or [0.0], 75.0))
     strong = [None if fit is None or fit.power < _WEAK * usual else fit for fit in fits]
@@ -89,7 +91,7 @@ def _judged(
 
 
 def _disagrees(gain: float, sigma: float) -> bool:
-    """Return whether a beam's position has static light, or more light moves than the beam has."""
+    """Return whether a beam has static light at its position, or more moving light than power."""
     return bool(abs(gain - 1.0) > max(_GAIN, _GAIN_SIGMAS * sigma))
 
 
@@ -111,7 +113,7 @@ def _gain(
         light = float(still.powers[index])
         share = float(still.sigmas[index]) / max(light, 1e-300)
     if not light > 0.0:
-        # Unknown without a picture of the empty surface; with such a picture, nothing moves there.
+        # The gain is unknown without a picture of the empty surface; with one, nothing moves there.
         return (np.nan, np.nan) if still is None else (np.inf, 0.0)
     gain = fit.power / light
     return gain, gain * float(np.sqrt(share**2 + (fit.power_sigma / fit.power) ** 2 + _SHAPE**2))

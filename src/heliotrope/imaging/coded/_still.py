@@ -9,10 +9,11 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded._bells import bell
 from heliotrope.imaging.coded.stack import Stack
 
-#: Light that no known beam explains is another beam from this share of the usual power.
+#: Light that no known beam explains counts as another beam if it has this fraction of the usual
+#: power.
 _OTHER = 0.35
 _MOST = 5
-#: A beam is on the surface if its light there, as a root mean square, is this share of the most.
+#: A beam is on the surface if the RMS of its light there is at least this fraction of the largest.
 _SHOWN = 1e-3
 
 
@@ -42,14 +43,14 @@ def still_light(
     places: Sequence[tuple[FloatArray, FloatArray]],
     moving: Sequence[float],
 ) -> StillLight:
-    """Decompose the mean picture (N,) into beams at known positions, and others.
+    """Decompose the mean picture (N,) into beams at known positions and other beams.
 
     Parameters
     ----------
     stack
         The prepared stack, with N seen pixels.
     mean
-        Light of all beams.
+        Mean light of all beams, (N,).
     places
         Position and second moments of each heliostat's beam.
     moving
@@ -69,7 +70,7 @@ def still_light(
         terms.append(bell(points, place, typical))
         powers, rest = _powers(terms, mean)
     design = np.stack(terms, axis=-1)
-    # The remainder is the error of the beam shapes, which is smooth over a beam.
+    # What remains is the error of the beam shapes, which is smooth over a beam.
     normal = np.linalg.pinv(design.T @ design)
     beam = 2.0 * np.pi * float(np.sqrt(np.linalg.det(typical))) / stack.step**2
     sigmas = np.sqrt(np.maximum(np.diag(normal), 0.0) * float(rest @ rest) / len(rest) * beam)
@@ -80,7 +81,7 @@ def still_light(
 
 
 def _powers(terms: list[FloatArray], mean: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return powers of 0 or more by least squares, and the residual.
+    """Return non-negative powers by least squares, and the residual.
 
     A beam that is almost entirely off the surface is assigned no power, because any power would
     explain it.

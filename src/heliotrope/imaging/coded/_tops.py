@@ -1,4 +1,4 @@
-"""The position of a beam in the pictures of its movement, by a matched filter."""
+"""Find a beam in the pictures of its movement with a matched filter."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.coded._bells import slopes
 from heliotrope.imaging.coded.stack import Stack
 
-#: Two tops of one code are at least this many standard deviations of a beam apart.
+#: Two peaks with the same code are at least this many standard deviations of a beam apart.
 _APART = 3.0
 
 
@@ -25,9 +25,9 @@ class Top:
     power
         Brightness m².
     significance
-        Power in robust standard deviations of the filter over the surface.
+        Power, in robust standard deviations of the filter output over the surface.
     second
-        Power of the second strongest beam, as a fraction.
+        Power of the second strongest beam, as a fraction of ``power``.
     """
 
     place: FloatArray
@@ -56,7 +56,7 @@ def find_top(
     axes
         The A axes of the movement.
     others
-        Positions of beams that were subtracted from the pictures: the remainder near them is the
+        Positions of beams that were subtracted from the pictures. What remains near them is the
         error of their shapes, not a beam.
     """
     from scipy.signal import fftconvolve
@@ -81,7 +81,7 @@ def find_top(
     place = np.array([x[best[1]], y[best[0]]])
     away = np.hypot(x[None, :] - place[0], y[:, None] - place[1]) > _APART * spread
     beside = power[away & stack.seen]
-    # The filter's noise away from this beam: half of the pixels lie within 0.674 σ.
+    # This is the noise of the filter away from the beam; half of the pixels lie within 0.674 σ.
     noise = float(np.median(np.abs(beside))) / 0.674 if beside.size else np.inf
     top = float(power[best])
     second = float(power[away & stack.seen & free].max(initial=0.0))

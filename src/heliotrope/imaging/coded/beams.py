@@ -1,4 +1,4 @@
-"""Expected and found beams of a stack."""
+"""Expected beams and found beams of a stack."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -20,7 +20,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class ExpectedBeam:
-    """The expected beam of a heliostat before a stack is taken.
+    """The beam that is expected of a heliostat before a stack is taken.
 
     Attributes
     ----------
@@ -33,8 +33,8 @@ class ExpectedBeam:
     second_moments
         Second moments of the light, m², (2, 2).
     power
-        Brightness m² at the exposure of the stack; NaN if unknown. Needed if there is other, static
-        light on the surface.
+        Power in brightness m², at the exposure of the stack; NaN if unknown. It is needed if there
+        is other, static light on the surface.
     power_sigma
         Relative standard deviation of ``power``.
     """
@@ -56,9 +56,10 @@ class SeparatedBeam:
     heliostat
         Name of the heliostat to which the code was assigned.
     verdict
-        Only a proven beam becomes a sighting.
+        Verdict on the beam; only a beam with the verdict ``PROVEN`` becomes a sighting.
     centroid
-        Position of its light without movement, m, (2,); NaN if no light follows the code.
+        Position of the heliostat's light without movement, m, (2,); NaN if no light follows the
+        code.
     covariance
         Covariance of the centroid, m², (2, 2).
     second_moments
@@ -70,7 +71,7 @@ class SeparatedBeam:
         follows its own code, 0 if it does not move), and its standard deviation. NaN if the light
         at that position is unknown.
     other
-        The heliostat with which it is swapped; empty otherwise.
+        The heliostat with which this heliostat is swapped; empty if it is not swapped.
     """
 
     heliostat: str

@@ -6,15 +6,15 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 
-#: Fewest and most photographs of a stack.
+#: Minimum and maximum number of photographs in a stack.
 _FEWEST, _MOST = 8, 1024
-#: Beams of one code are at least this many standard deviations apart: a matched filter sees one at
-#: the place of the other with less than 1 % of its height.
+#: Beams with the same code are at least this many standard deviations apart, so that a matched
+#: filter at the position of one beam responds to the other with less than 1 % of its height.
 APART = 4.5
 
 
 def photographs_for(mirrors: int, along: int | None = None) -> int:
-    """Return the smallest number of photographs with orthogonal codes for a number of heliostats.
+    """Return the fewest photographs that give ``mirrors`` heliostats orthogonal codes.
 
     Each heliostat takes two rows of a Hadamard matrix, one per axis, or one row if all move along
     the same axis; the row of ones stays unused.
@@ -28,22 +28,22 @@ def photographs_for(mirrors: int, along: int | None = None) -> int:
 def coded_movements(
     mirrors: int, photographs: int | None = None, along: int | None = None
 ) -> FloatArray:
-    """Return the movements of heliostats over photographs, -1 or 1, (photographs, heliostats, 2).
+    """Return the heliostats' movements, -1 or 1, (photographs, heliostats, 2).
 
     The columns are rows of Sylvester's Hadamard matrix without the row of ones, and are therefore
-    zero-mean and mutually orthogonal. A beam that moves along both axes at once also changes with
-    the product of its two codes, which is itself a row of the matrix. The rows are chosen so that
-    this product is the same unused row for all heliostats. The photographs are shuffled, always in
-    the same order.
+    zero-mean and mutually orthogonal. If a beam moves along both axes at once, its light also
+    changes with the product of its two codes, which is itself a row of the matrix. The rows are
+    chosen so that this product is the same unused row for all heliostats. The photographs are
+    shuffled, always in the same order.
 
     Parameters
     ----------
     mirrors
         Number of heliostats.
     photographs
-        Power of two; None: `photographs_for`.
+        Number of photographs, a power of two; None for the result of `photographs_for`.
     along
-        The single axis of all movements, 0 or 1; None: both axes.
+        The single axis of all movements, 0 or 1; None for both axes.
 
     Raises
     ------
@@ -60,8 +60,8 @@ def coded_movements(
             f"codes: {count} photographs for {mirrors} mirrors; use a power of two from {least} "
             f"to {_MOST}"
         )
-    # Neighbouring photographs differ in all codes, so that a cloud over a few of them, or a slow
-    # drift, is like none of the codes.
+    # Neighbouring photographs differ in all codes, so that a cloud during a few of them, or a slow
+    # drift, resembles none of the codes.
     order = np.random.default_rng(count).permutation(count)
     rows = hadamard(count).astype(np.float64)[:, order]
     first = 1 + np.arange(mirrors)
@@ -69,7 +69,7 @@ def coded_movements(
         moves = np.zeros((count, mirrors, 2))
         moves[..., along] = rows[first].T
         return moves
-    # Rows j and j + count/2 have the same product for each j: the row count/2.
+    # For every j, the product of rows j and j + count/2 is the same row, count/2.
     return np.ascontiguousarray(
         np.stack([rows[first], rows[first + count // 2]], axis=-1).transpose(1, 0, 2)
     )
@@ -93,7 +93,7 @@ def shared_codes(
 
     Returns
     -------
-        None if no code is free for some beam.
+        Index of the code of each beam; None if no code is available for one of the beams.
     """
     at, spread = np.asarray(places, dtype=np.float64), np.asarray(moments, dtype=np.float64)
     away = distances(at, spread)
@@ -103,13 +103,13 @@ def shared_codes(
         free = [code for code in range(groups) if code not in near]
         if not free:
             return None
-        # The code that was used least: light and noise are spread over all of them.
+        # Choose the least-used code, so that light and noise are spread over all codes.
         codes[i] = min(free, key=lambda code: int((codes[:i] == code).sum()))
     return codes
 
 
 def distances(places: FloatArray, moments: FloatArray) -> FloatArray:
-    """Return distances between places (M, 2), in standard deviations of the wider beam, (M, M)."""
+    """Return distances (M, M) between places, in standard deviations of the wider beam."""
     between = places[:, None] - places
     own = np.einsum("ijk,ikl,ijl->ij", between, np.linalg.inv(moments), between)
     return np.asarray(np.sqrt(np.minimum(own, own.T)))

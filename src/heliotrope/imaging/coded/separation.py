@@ -1,13 +1,13 @@
-"""From a stack of photographs and the codes of its heliostats to the beam of each heliostat.
+"""Find the beam of each heliostat from a stack of photographs and the heliostats' codes.
 
 Regressing the time series of each pixel on the codes yields two pictures per heliostat, one for the
 change caused by its movement along each axis. Orthogonal codes separate the pictures even where
-beams overlap, and static light appears in none of them. A beam of power p at x₀ has the pictures G
-= -p ∇f(x - x₀); their moments yield the power, ∫ x Gₓ = p, and the position, ½ ∫ x² Gₓ = p x₀,
-without any assumption about the beam shape. If the heliostats move along one axis only, half as
-many photographs are enough, because the single picture also yields the other coordinate, ∫ x y Gₓ =
-p y₀. A Gaussian is fitted first, which accounts for the finite size of the movements and for codes
-with missing photographs; the moments of the residual then correct the position.
+beams overlap, and static light appears in none of them. A beam of power p and shape f at x₀ has the
+pictures G = -p ∇f(x - x₀); their moments yield the power, ∫ x Gₓ = p, and the position, ½ ∫ x² Gₓ =
+p x₀, without any assumption about the beam shape. If the heliostats move along one axis only, half
+as many photographs are enough, because the single picture also yields the other coordinate, ∫ x y
+Gₓ = p y₀. A Gaussian is fitted first, which accounts for the finite size of the movements and for
+codes with missing photographs; the moments of the residual then correct the position.
 """
 
 from collections.abc import Sequence
@@ -35,13 +35,13 @@ class Separation:
     Attributes
     ----------
     beams
-        One per heliostat, in the order given.
+        One beam per heliostat, in the order of ``expected``.
     factors
         Relative light level of each photograph, 1 at the median, (K,).
     used
         Mask of the photographs used, (K,).
     uncoded
-        Positions of other, static beams on the surface, m, (U, 2).
+        Positions of static beams on the surface that belong to no heliostat, m, (U, 2).
     """
 
     beams: tuple[SeparatedBeam, ...]
@@ -51,7 +51,7 @@ class Separation:
 
     @property
     def proven(self) -> tuple[SeparatedBeam, ...]:
-        """Beams that may become sightings."""
+        """Beams whose verdict allows them to become sightings."""
         return tuple(beam for beam in self.beams if beam.verdict is Verdict.PROVEN)
 
 
@@ -63,8 +63,8 @@ def separate(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) 
     stack
         K photographs.
     moves
-        Commanded displacements on the surface, m, (K, M, 2): of all heliostats along both axes, or
-        of all along the same axis.
+        Commanded displacements on the surface, m, (K, M, 2). Either all heliostats move along both
+        axes, or all move along the same axis.
     expected
         M mirrors.
 
@@ -75,7 +75,7 @@ def separate(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) 
 
     Notes
     -----
-    The covariance includes everything that changes between photographs, and the uncorrected effect
+    The covariance includes all effects that change between photographs, and the uncorrected effect
     of the beam shape. Add the error of the rectified pictures themselves (camera, survey), as for
     ordinary spots.
     """
@@ -118,9 +118,9 @@ def _tops(
 ) -> list[Top]:
     """Return the strongest beam that follows each heliostat's code.
 
-    For n heliostats that share a code, the n strongest beams are found one after another, each
-    after subtracting the previous ones. Beams are assigned to heliostats so that the sum of their
-    distances from the expected positions is smallest.
+    For n heliostats that share a code, the n strongest beams are found one after another; each
+    found beam is subtracted before the next search. Beams are assigned to heliostats so that the
+    sum of their distances from the expected positions is smallest.
     """
     from scipy.optimize import linear_sum_assignment
 

@@ -10,7 +10,7 @@ from heliotrope.imaging.targets.rectify import Mask
 
 #: A photograph whose light is below this fraction of the usual light is left out.
 DARK = 0.5
-#: Pixels across the longer side that beams of decimetres need.
+#: Number of pixels across the longer side that decimetre-sized beams need.
 _ACROSS = 96
 
 
@@ -28,13 +28,14 @@ class Stack:
         Position of the first pixel's centre, metres to the right of and above the surface centre,
         (2,).
     seen
-        Pixels that measure light, (H, W): on the surface, not on a mark, never at full scale.
+        Mask of the pixels that measure light, (H, W): on the surface, not on a mark, and never at
+        full scale.
     exposures
-        Exposure times gain of each photograph, (K,); None: equal for all.
+        Exposure times gain of each photograph, (K,); None if equal for all.
     empty
         Brightness without beams at an exposure of 1 (or at that of the photographs, if it is equal
-        for all), (H, W). None: the surface carries other light than that of the coded beams, as a
-        receiver does.
+        for all), (H, W). None if the surface also carries light other than that of the coded beams,
+        as a receiver does.
     """
 
     values: FloatArray
@@ -67,7 +68,7 @@ class Stack:
 
     @property
     def axes(self) -> tuple[FloatArray, FloatArray]:
-        """Metres right of the centre for columns (W,), and above it for rows (H,)."""
+        """Column positions right of the centre, m, (W,), and row positions above it, m, (H,)."""
         _, rows, columns = self.values.shape
         return (
             self.first[0] + self.step * np.arange(columns),
@@ -94,7 +95,7 @@ class Stack:
             shrunk(values),
             self.step * factor,
             np.asarray(self.first) + np.array([shift, -shift]),
-            # The middle of half-masked pixels is unknown.
+            # For pixels that are half masked, the centre of the unmasked part is unknown.
             known > 0.999,
             None,
             None if self.empty is None else shrunk(np.asarray(self.empty, dtype=np.float64)),
@@ -119,9 +120,9 @@ class Light:
     pictures
         Brightness due to beams divided by ``factors``, N seen pixels, (K, N).
     factors
-        Light of the beams in each photograph, 1 at its median, (K,).
+        Light of the beams in each photograph, divided by its median, (K,).
     weights
-        Of each photograph, 0 if it is left out, (K,).
+        Weight of each photograph, (K,); 0 if the photograph is left out.
     """
 
     pictures: FloatArray
@@ -145,9 +146,9 @@ def light_of(values: FloatArray, empty: FloatArray | None, moved: FloatArray | N
     values
         Brightness of seen pixels, (K, N).
     empty
-        Without beams, (N,).
+        Brightness without beams, (N,).
     moved
-        Change of brightness by the movements known so far, (K, N).
+        Change of brightness due to the movements known so far, (K, N).
     """
     count = len(values)
     change = np.zeros_like(values) if moved is None else moved
@@ -160,7 +161,7 @@ def light_of(values: FloatArray, empty: FloatArray | None, moved: FloatArray | N
         if empty is None:
             factors = with_beams / own
         else:
-            # The normal equations of two unknowns.
+            # These are the normal equations for the two unknowns.
             cross, plain, with_empty = beams @ empty, empty @ empty, values @ empty
             determinant = own * plain - cross**2
             factors = (plain * with_beams - cross * with_empty) / determinant

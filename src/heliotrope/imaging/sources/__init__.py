@@ -6,7 +6,7 @@ A source is a context manager that yields frames::
         frame = average(source)
 
 Begin with `open_source`, which accepts the source text of a camera in the plant file. `average`
-reduces noise, `keep` archives a frame with its result.
+reduces noise, and `keep` archives a frame with its result.
 """
 
 from heliotrope.imaging.sources.folder import FolderSource

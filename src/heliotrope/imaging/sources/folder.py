@@ -14,7 +14,7 @@ from heliotrope.imaging.sources.source import Source
 
 @dataclass
 class FolderSource(Source):
-    """The images in a folder in natural order and, if it is watched, images that arrive later.
+    """The images in a folder, in natural order, and later images if the folder is watched.
 
     A file in a watched folder is read once it is complete and has not changed between two polls. A
     file that changes later is read again, so a camera may always overwrite the same file. If the
@@ -31,7 +31,7 @@ class FolderSource(Source):
         folder counts as broken, s.
     skip_broken
         Whether to leave out broken files and list them in ``skipped`` instead of raising
-        FormatError; None: leave them out if the folder is watched.
+        FormatError; None to leave them out only if the folder is watched.
     read
         Function that reads a file; by default `heliotrope.imaging.files.read_image`.
     wait
@@ -67,8 +67,8 @@ class FolderSource(Source):
         self.skipped.append(error)
 
     def _frames(self) -> Iterator[Frame]:
-        done: dict[Path, tuple[int, ...]] = {}  # state of each file when it was dealt with
-        looks: dict[Path, tuple[tuple[int, ...], int]] = {}  # looks for which it has been the same
+        done: dict[Path, tuple[int, ...]] = {}  # state of each file when it was read or given up
+        looks: dict[Path, tuple[tuple[int, ...], int]] = {}  # number of polls since the last change
         needed, patience = (2, self.patience) if self.watch else (1, 0.0)
         while not self.stop.is_set():
             paths: dict[Path, None] = {}
@@ -99,7 +99,7 @@ class FolderSource(Source):
 
 
 def _state(path: Path) -> tuple[int, ...]:
-    """Return inode, size and time of change of a file; () if it does not exist."""
+    """Return the inode, size and modification time of a file; () if it does not exist."""
     try:
         status = path.stat()
     except OSError:

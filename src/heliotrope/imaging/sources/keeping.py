@@ -1,4 +1,4 @@
-"""Averages and archives the frames from a source."""
+"""Average and archive the frames from a source."""
 
 import json
 import math
@@ -23,7 +23,7 @@ from heliotrope.imaging.motion import find_shift
 
 
 def average(frames: Iterable[Frame], max_shift: float = 1.0) -> Frame:
-    """Return the mean of several frames, which divides the noise by the root of their number.
+    """Return the mean of N frames, in which the noise is smaller by the factor √N.
 
     Parameters
     ----------
@@ -94,11 +94,11 @@ def keep(frame: Frame, result: Mapping[str, Any], folder: str | Path) -> Path:
         Numbers, texts, arrays, times and paths; numbers that are not finite become null.
     folder
         Folder, created if needed. Nothing in it is overwritten; a second frame with the same name
-        gets a number. The JSON file is written last, so if it is present the PNG is complete.
+        receives a number. The JSON file is written last, so if it is present the PNG is complete.
 
     Returns
     -------
-    The PNG.
+    Path of the PNG.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def keep(frame: Frame, result: Mapping[str, Any], folder: str | Path) -> Path:
             notes = image.with_suffix(".json")
             with suppress(FileExistsError):
                 if not notes.exists():
-                    image.hardlink_to(draft)  # fails if it is there, where a rename would not
+                    image.hardlink_to(draft)  # fails if the file exists, unlike a rename
                     break
     except OSError as error:
         raise InputError(

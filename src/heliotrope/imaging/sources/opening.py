@@ -1,4 +1,4 @@
-"""Opens the frame source specified by a line of text."""
+"""Open the frame source specified by a line of text."""
 
 import re
 import threading
@@ -34,9 +34,10 @@ def open_source(
     Parameters
     ----------
     text
-        Folder, image or video file; rtsp://…, http://… (MJPEG, or …/now.jpg); usb:0, /dev/video0.
+        A folder, image or video file; rtsp://…; http://… (MJPEG, or …/now.jpg); usb:0; or
+        /dev/video0.
     folder
-        Folder to which relative paths refer: that of the plant file.
+        Folder to which relative paths refer, usually that of the plant file.
     start, size, watch
         Time of a video's first frame; frame size requested from a device; whether to watch a
         folder.

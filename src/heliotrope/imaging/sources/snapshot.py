@@ -30,9 +30,9 @@ def is_snapshot(text: str) -> bool:
 class SnapshotSource(Source):
     """Photographs that a camera takes on request.
 
-    A frame's time is that stored in the file, if any; otherwise the midpoint between request and
-    response, with half of the interval as its standard deviation. A user name and password in the
-    address are sent as credentials and never displayed.
+    A frame's time is the time stored in the file, if any. Otherwise it is the midpoint between
+    request and response, with half of that interval as its standard deviation. A user name and
+    password in the address are sent as credentials and never displayed.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class SnapshotSource(Source):
             )
 
     def _frames(self) -> Iterator[Frame]:
-        """Yield photographs until stopped.
+        """Yield photographs until the source is stopped.
 
         Raises
         ------

@@ -22,12 +22,12 @@ class Source(ABC):
     name
         Name used in errors and frames; by default the folder, file, address or device.
     limit
-        Number of frames after which the source ends; None: no limit.
+        Number of frames after which the source ends; None for no limit.
     stop
         Event that ends the source when set.
     wanted
         Event that is set when a caller waits for a frame; a source that takes frames at intervals
-        then takes one at once.
+        then takes a frame at once.
     """
 
     name: str = ""
@@ -49,10 +49,10 @@ class Source(ABC):
 
     @abstractmethod
     def _frames(self) -> Iterator[Frame]:
-        """Yield frames until stopped."""
+        """Yield frames until the source is stopped."""
 
     def _begin(self) -> None:  # noqa: B027 - some sources have nothing to open
-        """Open the source, or raise an error."""
+        """Open the source; raise an error if that fails."""
 
     def _end(self) -> None:  # noqa: B027
         """Close the source."""
@@ -60,7 +60,7 @@ class Source(ABC):
 
 @dataclass
 class SimulatedSource(Source):
-    """Frames that ``function`` creates for, and that carry, the current time of ``clock``."""
+    """Frames that ``function`` creates for the current time of ``clock``."""
 
     function: Callable[[datetime], Frame]
     clock: Callable[[], datetime]
@@ -73,5 +73,5 @@ class SimulatedSource(Source):
 
 
 def hide_password(url: str) -> str:
-    """Return an address without user and password."""
+    """Return an address without user name and password."""
     return re.sub(r"(?<=://)[^/?#]*@", "", url)

@@ -31,16 +31,16 @@ class VideoSource(Source):
     """The frames of a video file that OpenCV's FFmpeg can decode.
 
     A frame's time is ``start`` plus its position, rounded to the frame interval. A truncated file
-    ends early without an error; afterwards ``missing`` is the number of frames missing compared
-    with what the container announced (an estimate in some formats).
+    ends early without an error; afterwards ``missing`` is the number of frames by which the file
+    falls short of the number in the container header (an estimate in some formats).
 
     Attributes
     ----------
     path
         The file.
     start, start_deviation
-        Time of the first frame with its time zone (without it frames have no time), and its
-        standard deviation, s.
+        Time of the first frame with its time zone, and the standard deviation of that time, s.
+        Without a start time, frames have no time.
     """
 
     path: str | Path
@@ -93,7 +93,7 @@ class VideoSource(Source):
 
 
 def _capture(place: str, backend: int, options: list[int] | None = None) -> Any:
-    """Return an open capture, or None. OpenCV and FFmpeg are kept from writing to stderr."""
+    """Return an open capture, without output to stderr; None if it cannot be opened."""
     import cv2
 
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
@@ -110,24 +110,25 @@ def _capture(place: str, backend: int, options: list[int] | None = None) -> Any:
 class CameraSource(Source):
     """The newest frame from a free-running camera.
 
-    A thread reads all frames and keeps the last, so a slow reader gets fewer frames but never
-    outdated ones (``dropped`` counts the rest). If the connection to the camera is lost, it is
-    reopened after pauses that double each time (``reconnects`` counts). If that fails too often, or
-    at the first attempt, reading raises FetchError (a stream) or InputError (a device).
+    A thread reads all frames and keeps only the newest, so a slow caller receives fewer frames but
+    never outdated ones (``dropped`` counts the skipped frames). If the connection to the camera is
+    lost, it is reopened after pauses that double each time (``reconnects`` counts the attempts). If
+    that fails too often, or if the first connection fails, reading raises FetchError for a stream
+    or InputError for a device.
 
     Attributes
     ----------
     latency, latency_deviation
         Delay from the middle of the exposure to the arrival of the frame, and its standard
-        deviation, s. A frame's time is its arrival minus ``latency``. Streams have 0.1 s to 2 s,
-        which should be measured.
+        deviation, s. A frame's time is its arrival minus ``latency``. Streams have delays of 0.1 s
+        to 2 s, which should be measured.
     retries, pause, longest_pause
-        Number of consecutive failures before it gives up; first and longest pause before a retry,
-        s.
+        Number of consecutive failures after which reading stops with an error, and first and
+        longest pause before a retry, s.
     clock
         Function that returns the current time with its time zone.
     exposure, gain
-        Copied into the frames; NaN if unknown.
+        Exposure and gain to copy into the frames; NaN if unknown.
     """
 
     latency: float = field(default=0.0, kw_only=True)
@@ -168,7 +169,7 @@ class CameraSource(Source):
         return self._closing.is_set() or self.stop.is_set()
 
     def _read(self, capture: Any) -> None:
-        """Read until closed or stopped, in a thread; keep the error if it gives up."""
+        """Read frames in a thread until the source is closed; store the error if reading fails."""
         failures = 0
         try:
             while not self._over():
@@ -249,7 +250,7 @@ class StreamSource(CameraSource):
         if capture is not None:
             return capture
         text = "it responds, but not with video; check the path, the user and the password"
-        try:  # OpenCV does not say why
+        try:  # OpenCV does not state a reason
             socket.create_connection(self._place, min(self.timeout, 5.0)).close()
         except OSError as error:
             why = error.strerror or str(error)
@@ -261,13 +262,13 @@ class StreamSource(CameraSource):
 class UsbSource(CameraSource):
     """A camera attached to this computer, via Video4Linux.
 
-    ``exposure`` is set in steps of 100 µs, ``gain`` in the camera's own steps; NaN leaves them
-    automatic. If the camera does not accept a value, InputError is raised.
+    ``exposure`` is set in steps of 100 µs and ``gain`` in the camera's own steps; NaN leaves a
+    setting automatic. If the camera does not accept a value, InputError is raised.
 
     Attributes
     ----------
     device
-        Number, or /dev/videoN.
+        Device number, or /dev/videoN.
     width, height
         Requested frame size, px; 0 for the camera's default.
     """
@@ -299,7 +300,7 @@ class UsbSource(CameraSource):
             )
             raise InputError(f"source {self.name}: {text}")
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        # Video4Linux counts exposures in 100 µs; entry 1 of its menu is "manual".
+        # Video4Linux counts exposures in units of 100 µs; entry 1 of its exposure menu is "manual".
         settings = [
             (cv2.CAP_PROP_FRAME_WIDTH, "width", self.width or math.nan, " px"),
             (cv2.CAP_PROP_FRAME_HEIGHT, "height", self.height or math.nan, " px"),

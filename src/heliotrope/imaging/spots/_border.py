@@ -1,4 +1,4 @@
-"""Estimates the light of a beam beyond the target border from its decline at the border."""
+"""Estimate the light of a beam beyond the target border from its decline at the border."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,8 @@ _RAYS = 120
 _SLOPE = 0.3
 #: Maximum decline, relative to a Gaussian of the beam's second moments.
 _STEEPER = 3.0
-#: At the border: below the first share of its peak a beam ends, above the second it goes on.
+#: If its brightness at the border is below the first fraction of its peak, a beam ends there; above
+#: the second, it continues.
 _ENDS, _GOES_ON = 0.05, 0.25
 
 
@@ -25,12 +26,12 @@ class Beyond:
     Attributes
     ----------
     share
-        This light as a fraction of all light of the beam.
+        Light beyond the border, as a fraction of all the light of the beam.
     shift
         Shift of the centroid, m, (2,).
     most
-        Upper bound of the shift: the shift if the beam continued as a Gaussian indefinitely, m,
-        (2,).
+        Upper bound of the shift, m, (2,): the shift if the beam continued indefinitely as a
+        Gaussian.
     """
 
     share: float
@@ -61,18 +62,18 @@ def beyond(
     region
         Pixels of the beam, (H, W).
     total, peak, centroid, moments
-        Visible light: sum, m², maximum, centre, m, and second moments, m².
+        Sum, m², maximum, centre, m, and second moments, m², of the visible light.
 
     Notes
     -----
-    Along a ray from the centroid, the beam beyond the border at r0, where its brightness is b, is
-    assumed to be b exp((r0² − r²)/2σ²). σ follows from the second moments in this direction, and is
-    smaller if the beam falls more steeply just before the border. The light is then b σ² per
-    radian, and its first moment b (σ² r0 + σ³ √(π/2) erfcx(r0/√2σ)).
+    Consider a ray from the centroid that crosses the border at r0, where the brightness is b.
+    Beyond the border the beam is assumed to be b exp((r0² − r²)/2σ²). σ follows from the second
+    moments in this direction, and is smaller if the beam falls more steeply just before the border.
+    The light is then b σ² per radian, and its first moment b (σ² r0 + σ³ √(π/2) erfcx(r0/√2σ)).
 
     Heliostat beams end where a Gaussian would continue, so the light beyond the border is weighted
     from 0, where b is a twentieth of the peak, to 1, where b is a quarter of it. For 107 rendered
-    beams that lose up to a tenth of their light, a third of the shift remains.
+    beams that lose up to a tenth of their light, a third of the shift remains uncorrected.
     """
     from scipy.special import erfcx
 
@@ -101,9 +102,9 @@ def beyond(
 def _at_border(
     picture: Rectified, soft: Image, region: Mask, centroid: FloatArray, ray: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return where rays leave a beam, its brightness there, and its logarithmic decline, 1/m.
+    """Return where rays leave a beam, the brightness there, and the logarithmic decline, 1/m.
 
-    The brightness is 0 for rays that leave the beam elsewhere than at the border.
+    The brightness is 0 for rays that leave the beam before they reach the border.
     """
     r = picture.step * np.arange(1, int(np.hypot(*picture.shape)))
     pixel = np.round(picture.pixels(centroid + r[:, None, None] * ray)).astype(int)

@@ -1,4 +1,4 @@
-"""Straight shadow edges across a face: finds them, and refines them in a background fit.
+"""Find straight shadow edges across a face, and refine them in a background fit.
 
 Positions are columns and rows from the middle of the grid on which backgrounds are fitted; rows run
 downwards.
@@ -14,15 +14,15 @@ from heliotrope.imaging.targets.rectify import Mask
 
 #: Distance to either side of a line at which brightness is compared, cells.
 _ARM = 2.0
-#: Steps between the directions (rad) and offsets (cells) of lines that are tried.
+#: Steps between the directions (rad) and between the offsets (cells) of trial lines.
 _TURN, _SHIFT = np.radians(5.0), 1.0
 #: Minimum visible length of a line, cells.
 _LENGTH = 12
 #: Minimum change of brightness: relative to the face, and to the median of all lines.
 _CHANGE, _ABOVE = 0.02, 5.0
-#: At one end of a line at least, the change must agree with the rest to this share.
+#: At one end of a line at least, the change must agree with the rest of the line to this fraction.
 _ALIKE = 0.25
-#: Maximum turn (rad), shift (cells) and relative widening of an edge in one step of the fit.
+#: Maximum rotation (rad), shift (cells) and relative widening of an edge in one step of the fit.
 _STEP = np.array([0.06, 1.5, 0.5])
 
 
@@ -33,13 +33,13 @@ class Edge:
     Attributes
     ----------
     angle
-        Angle of its normal, clockwise from the right, rad.
+        Angle of the edge's normal, clockwise from the right, rad.
     offset
-        Along the normal, from the middle, cells.
+        Distance along the normal from the middle of the grid, cells.
     breadth
-        Standard deviation of its blur, cells.
+        Standard deviation of the edge's blur, cells.
     height
-        Approximate rise of brightness across it.
+        Approximate rise of brightness across the edge.
     """
 
     angle: float
@@ -48,7 +48,7 @@ class Edge:
     height: float = 0.0
 
     def distance(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the signed distances of positions beyond the edge, cells."""
+        """Return the signed distances of positions from the edge, positive beyond it, cells."""
         return np.asarray(x * np.cos(self.angle) + y * np.sin(self.angle) - self.offset)
 
     def step(self, x: FloatArray, y: FloatArray, breadth: float | None = None) -> FloatArray:
@@ -59,7 +59,7 @@ class Edge:
         return np.asarray(ndtr(self.distance(x, y) / soft))
 
     def columns(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the step, the step along x and y, and its derivatives, (..., 6).
+        """Return the step, the step times x and times y, and the step's derivatives, (..., 6).
 
         The derivatives are with respect to angle, offset and the logarithm of the breadth.
         """
@@ -81,7 +81,7 @@ class Edge:
         )
 
     def moved(self, numbers: FloatArray) -> "Edge":
-        """Return the edge moved by the six numbers fitted to its columns."""
+        """Return the edge moved by the six coefficients fitted to its `columns`."""
         height = numbers[0]
         if abs(height) < 1e-9:
             return self
@@ -120,7 +120,7 @@ def prior(level: float) -> FloatArray:
 
 
 def places(shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Return columns and rows of a grid from its middle, (H, W) each."""
+    """Return the columns and rows of a grid, counted from its middle, (H, W) each."""
     rows, columns = shape
     y, x = np.mgrid[0:rows, 0:columns].astype(np.float64)
     return x - 0.5 * (columns - 1), y - 0.5 * (rows - 1)
@@ -129,8 +129,8 @@ def places(shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
 def find_edges(soft: FloatArray, paint: Mask, most: int = 3) -> list[Edge]:
     """Return straight lines with a uniform change of brightness across them, the best first.
 
-    Along a shadow's edge the change is uniform, so its quartiles agree; the flank of a beam is
-    curved and ends.
+    Along a shadow's edge the change is uniform, so its quartiles agree. The flank of a beam, in
+    contrast, is curved and ends within the face.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def find_edges(soft: FloatArray, paint: Mask, most: int = 3) -> list[Edge]:
     paint
         Mask of bare paint.
     most
-        Greatest number of lines.
+        Maximum number of lines.
     """
     rows, columns = soft.shape
     reach = 0.5 * float(np.hypot(rows, columns))
@@ -195,7 +195,7 @@ def _changes(
     width = ranges[rows, best]
     middle = 0.5 * (difference[rows, best] + difference[rows, upper[rows, best]])
     size = np.abs(middle)
-    # A beam's flank ends before the face does; one end of a shadow at least is free of beams.
+    # A beam's flank ends within the face, whereas at least one end of a shadow is free of beams.
     even = np.zeros(len(count), dtype=bool)
     for end in ends:
         even |= np.abs(end - middle) < _ALIKE * size

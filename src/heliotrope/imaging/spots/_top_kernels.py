@@ -1,6 +1,6 @@
 # mypy: disable-error-code="no-untyped-call, untyped-decorator"
 # mypy: allow-untyped-defs
-"""Compiled: assigns each pixel of a picture to the local maximum from which it descends."""
+"""Compiled kernels: assign each pixel to the local maximum from which it descends."""
 
 import numpy as np
 from numba import njit
@@ -10,7 +10,7 @@ from heliotrope.jit import INNER, OPTIONS
 
 @njit(**INNER)
 def _root(parent, number):
-    """Follow merges and return the final top of a given top."""
+    """Follow merges and return the number of the top into which a top was finally merged."""
     while parent[number] != number:
         parent[number] = parent[parent[number]]
         number = parent[number]
@@ -22,22 +22,23 @@ def number_tops(values, inside, foot, seed, dip, least, owner):
     """Label the local maxima (tops) of a picture in ``owner`` (H, W), and return their number.
 
     Pixels are processed in order of decreasing brightness. A pixel without labelled neighbours
-    starts a new top. Where two tops meet, the lower one is merged into the higher one, unless it is
-    at least as high as ``seed`` and brightness has dropped from it by the fraction ``dip`` and by
-    ``least``. Other pixels join the top of their brightest neighbour.
+    starts a new top. Where two tops meet, the lower top is merged into the higher one. The tops
+    stay separate if the lower one is at least as high as ``seed`` and the brightness has dropped
+    from it by the fraction ``dip`` and by ``least``. Other pixels join the top of their brightest
+    neighbour.
 
     Parameters
     ----------
     values
         Brightness, (H, W).
     inside
-        Which pixels count, (H, W).
+        Mask of the pixels to label, (H, W).
     foot
         Fainter pixels belong to no top.
     seed, dip, least
         See above.
     owner
-        Numbers from 1, highest first; 0 for none. (H, W) of int32.
+        Numbers of the tops from 1, highest first, and 0 for no top, (H, W), int32.
     """
     rows, columns = values.shape
     flat = values.ravel()

@@ -1,4 +1,4 @@
-"""Estimates what a target would look like without beams."""
+"""Estimate what a target would look like without beams."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -17,38 +17,42 @@ from heliotrope.imaging.spots._shadow import Edge, border, find_edges, places
 from heliotrope.imaging.spots._shadow import prior as edge_prior
 from heliotrope.imaging.targets.rectify import Mask, Rectified
 
-#: How a background is found; "auto" takes the best that is available.
+#: Methods to estimate a background; "auto" uses the best available method.
 Method = Literal["auto", "frame", "model", "difference"]
-#: The fit uses every sixth pixel each way.
+#: The fit uses every sixth pixel in each direction.
 _STRIDE = 6
-#: Order of the polynomial across a target; higher along a longer face.
+#: Order of the polynomial across a target; it is higher along a longer face.
 _ORDER = 6
-#: Light on a target is smooth: terms of order n have a standard deviation of this over n^1.5,
-#: relative to the mean. Photographs of empty targets have 0.06 at order 1 and 0.005 at order 6.
+#: Because the light on a target is smooth, terms of order n have a prior standard deviation of this
+#: value over n^1.5, relative to the mean. Photographs of empty targets show 0.06 at order 1 and
+#: 0.005 at order 6.
 _UNEVEN = 0.1
-#: Initial area over which joints and stains are correlated, m²; it is then measured.
+#: Initial value of the area over which joints and stains are correlated, m², before it is measured.
 _PATCH = 0.4
-#: Beams are brighter than the background by this many deviations,
+#: Beams are brighter than the background by this many standard deviations,
 _HOT = 3.0
-#: and by at least this share of it.
+#: and by at least this fraction of the background.
 _HOT_PART = 0.002
-#: Frames from which on a model knows the paint better than a single frame.
+#: Number of frames from which on a model describes the paint better than a single frame.
 _KNOWN = 3.0
-#: Unevenness of a frame's light relative to the prior: weight of the prior, and bounds.
+#: Unevenness of a frame's light relative to the prior: weight of the prior, and limits.
 _EVEN = (0.01, 0.05, 1.5)
 #: Blur of the face before the fit, grid pixels.
 _SOFT = 2.0
-#: Unexplained places at a face's border above which a shadow is looked for.
+#: A shadow is searched for if at least this many places at a face's border are unexplained.
 _BORDER = 4
-#: Bounds, relative to the brightness, on the three deviations beyond which a place is unexplained.
+#: A place is unexplained beyond three standard deviations, which are limited to these fractions of
+#: the brightness.
 _ODD = (0.015, 0.03)
-#: Minimum gain in explained paint by an edge, and least height of the edge in its deviations.
+#: Minimum gain in explained paint through an edge, and minimum height of the edge in its standard
+#: deviations.
 _GAIN, _CERTAIN = 0.02, 4.5
-#: Paint is as expected within this many deviations, or this share of the brightness.
+#: Paint is as expected if it is within this many standard deviations, or this fraction of the
+#: brightness.
 _PLAIN, _PLAIN_PART = 4.0, 0.02
-#: Deviations over less than this belong to the paint, m.
+#: Deviations that extend over less than this, m, belong to the paint.
 BROAD = 0.3
-#: Minimum share of the paint that the fit keeps.
+#: Minimum fraction of the paint that the fit keeps.
 _FEWEST = 0.06
 #: Iterations of the fit in which the edge of a shadow is moved.
 _SETTLING = 6
@@ -82,8 +86,8 @@ class Background:
     seen
         Fraction of the paint that was free of beams.
     reflectance
-        Reflectance of the paint relative to the usual value, (H, W), or None. Dividing the light by
-        it yields the light that falls on the face.
+        Reflectance of the paint relative to the usual value, (H, W); None if unknown. Dividing the
+        reflected light by this reflectance yields the light that falls on the face.
     """
 
     values: Image
@@ -101,8 +105,8 @@ class Background:
 def from_frame(picture: Rectified) -> Background:
     """Return the background from one frame alone, assuming smooth light on uniform paint.
 
-    A polynomial is fitted to the paint that no beam illuminates. Beams are bright and stand out
-    above the fit. They are excluded with their surroundings, and the fit is repeated until nothing
+    A polynomial is fitted to the paint that no beam illuminates. Beams stand out above the fit.
+    They are excluded together with their surroundings, and the fit is repeated until nothing
     changes.
     """
     return _fit(picture, np.ones(picture.shape, dtype=np.float32), _orders(picture), "frame")
@@ -136,9 +140,9 @@ class EmptyTarget:
     reflectance
         Brightness relative to that of the smooth light, (H, W).
     weight
-        Number of frames behind each pixel, with lower weight for old frames, (H, W).
+        Number of frames that contributed to each pixel, with lower weight for old frames, (H, W).
     memory
-        Frames after which the weight of a frame falls to 1/e.
+        Number of frames after which the weight of a frame falls to 1/e.
     targets
         Names of the face's targets.
     """
@@ -150,7 +154,7 @@ class EmptyTarget:
 
     @staticmethod
     def of(picture: Rectified, memory: float = 50.0) -> "EmptyTarget":
-        """Return a model without any frame."""
+        """Return a model that contains no frame yet."""
         ones = np.ones(picture.shape, dtype=np.float32)
         names = tuple(target.name for target in picture.face.targets)
         return EmptyTarget(ones, np.zeros_like(ones), memory, names)
@@ -207,9 +211,9 @@ class EmptyTarget:
         Raises
         ------
         InputError
-            If no such file.
+            If there is no such file.
         FormatError
-            If the file is not such a model.
+            If the file is not a model of an empty target.
         """
         file = Path(path)
         held = read_arrays(
@@ -233,7 +237,7 @@ class EmptyTarget:
 
     @property
     def ready(self) -> bool:
-        """Whether the model knows the paint better than a single frame does."""
+        """Whether the model describes the paint better than a single frame does."""
         return float(np.median(self.weight)) >= _KNOWN
 
     def fits(self, picture: Rectified) -> bool:
@@ -289,9 +293,9 @@ def of_face(
     method
         "frame", "model", "difference", or "auto" for the best that is available.
     models
-        Models of empty faces; the matching one is used.
+        Models of empty faces; the model that matches the face is used.
     empty
-        The same face without beams.
+        Picture of the same face without beams.
 
     Raises
     ------
@@ -317,7 +321,7 @@ def of_face(
 
 
 def beams(picture: Rectified, background: Background) -> Mask:
-    """Return the pixels that a beam lights, tails included, (H, W)."""
+    """Return a mask of the pixels that a beam illuminates, including its tails, (H, W)."""
     import cv2
 
     above = smooth(picture, picture.values - background.values, 2.0)
@@ -329,8 +333,8 @@ def beams(picture: Rectified, background: Background) -> Mask:
 def unexplained(picture: Rectified, background: Background, spots: Sequence[Mask]) -> float:
     """Return the fraction of paint beside the spots that is brighter or darker than expected.
 
-    Causes are shadows, stray light and obstacles. Only areas broader than `BROAD` metres
-    count, so that single pixels, joints and stains do not.
+    Causes are shadows, stray light and obstacles. Only areas broader than `BROAD` metres count, so
+    that single pixels, joints and stains are ignored.
     """
     import cv2
 
@@ -377,7 +381,7 @@ def _orders(picture: Rectified) -> tuple[int, int]:
 
 
 def _terms(orders: tuple[int, int]) -> list[tuple[int, int, float]]:
-    """Return the orders of the fitted polynomial products: across, up, and total."""
+    """Return the orders of the fitted polynomial terms: across, up, and in total."""
     top = min(order for order in orders if order > 0)
     terms = []
     for i in range(orders[0] + 1):
@@ -390,7 +394,7 @@ def _terms(orders: tuple[int, int]) -> list[tuple[int, int, float]]:
 
 @lru_cache(maxsize=16)
 def _polynomials(shape: tuple[int, int], orders: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Legendre polynomials over a grid, (H, W, K), and their orders across a target, (K,)."""
+    """Return Legendre polynomials over a grid, (H, W, K), and orders across a target, (K,)."""
     along_x = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, shape[1]), orders[0])
     along_y = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, shape[0]), orders[1])
     terms = _terms(orders)
@@ -409,9 +413,9 @@ def _ridge(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return the parameters of maximum posterior probability and their covariance.
 
-    The first ``evenness`` parameters describe smooth light. Its smoothness differs from frame to
-    frame, so their prior deviations are scaled to the values found (expectation maximisation of
-    a variance, with a weak prior for a small one).
+    The first ``evenness`` parameters describe smooth light. The smoothness differs from frame to
+    frame, so the prior standard deviations of these parameters are scaled to fit their values
+    (expectation maximisation of a variance, with a weak prior that favours a small variance).
     """
     G, r = A.T @ A / variance, A.T @ b / variance
     numbers, covariance = np.zeros(len(prior)), np.zeros((len(prior), len(prior)))
@@ -431,7 +435,7 @@ def _ridge(
 
 @dataclass(frozen=True)
 class _Grid:
-    """The data of a fit: paint on its grid, and the functions of smooth light there."""
+    """The data of a fit: paint on the fit grid, and the functions of smooth light there."""
 
     soft: FloatArray
     paint: Mask
@@ -467,7 +471,7 @@ def _fit(
     method: str,
     reflectance: Image | None = None,
 ) -> Background:
-    """Fit pattern × polynomial, and the edge of a shadow if any, to paint without beams."""
+    """Fit pattern × polynomial, plus a shadow edge if there is one, to paint without beams."""
     grid = _grid(picture, pattern, orders)
     fit = _converged(grid, None)
     even, odd = grid.soft / np.maximum(grid.multiplier, 0.05), _odd(fit, grid)
@@ -526,7 +530,7 @@ def _grid(picture: Rectified, pattern: Image, orders: tuple[int, int]) -> _Grid:
 
 
 def _better(other: _Fit, fit: _Fit, grid: _Grid) -> bool:
-    """Return whether a fit with an edge is better than a fit without it or with a different edge.
+    """Return whether a fit with an edge is better than one without it or with another edge.
 
     The better fit must explain more of the paint to the same accuracy, and the height of its edge
     must be significant in paint without beams.
@@ -555,7 +559,7 @@ def _odd(fit: _Fit, grid: _Grid) -> Mask:
 
 
 def _converged(grid: _Grid, edge: Edge | None) -> _Fit:
-    """Fit, exclude outliers with their surroundings, and repeat until convergence."""
+    """Fit, exclude outliers and their surroundings, and repeat until convergence."""
     import cv2
 
     paint, soft, basis, prior = grid.paint, grid.soft, grid.basis, grid.prior
@@ -580,7 +584,7 @@ def _converged(grid: _Grid, edge: Edge | None) -> _Fit:
         spread = 1.4826 * float(np.median(np.abs(residuals[free] - middle))) + 0.15 / 255.0
         hot = paint & (residuals > max(_HOT * spread, _HOT_PART * grid.level))
         if edge is not None and turn < _SETTLING:
-            # Until the edge has settled, residuals near it are not a beam.
+            # Until the edge has settled, residuals near it are not taken for a beam.
             hot &= np.abs(edge.distance(x, y)) > 2.0 * edge.breadth + 2.0
         grown = cv2.dilate(cv2.morphologyEx(hot.astype(np.uint8), cv2.MORPH_OPEN, cross), reach)
         now = paint & (grown == 0)
@@ -595,7 +599,7 @@ def _converged(grid: _Grid, edge: Edge | None) -> _Fit:
 def _upscaled(
     shape: tuple[int, int], orders: tuple[int, int], numbers: FloatArray, edge: Edge | None
 ) -> FloatArray:
-    """Evaluate the fitted light on the whole grid, of which the fit grid is a regular subset."""
+    """Evaluate the fitted light on the whole grid; the fit grid is a regular subset of it."""
     rows = len(np.arange(_STRIDE // 2, shape[0], _STRIDE))
     columns = len(np.arange(_STRIDE // 2, shape[1], _STRIDE))
 
@@ -626,7 +630,7 @@ def _patch(residuals: FloatArray, held: Mask) -> float:
     """Return the number of grid points over which residuals are correlated.
 
     This is the integral of the autocorrelation up to its first zero. For an irregular region, the
-    autocorrelation is that of the values divided by that of the mask, both computed with Fourier
+    autocorrelation of the values is divided by that of the mask; both are computed with Fourier
     transforms.
     """
     count = float(held.sum())

@@ -1,4 +1,4 @@
-"""User-defined centroids: from the picture of a beam to its position and covariance."""
+"""User-defined centroid functions, which convert the picture of a beam to its position."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from heliotrope.imaging.targets.rectify import Mask, Rectified
 
 @dataclass(frozen=True)
 class BeamPicture:
-    """A beam on its target, seen from the front: the input of a user-defined centroid.
+    """A beam on its target, seen from the front, as passed to a user-defined centroid function.
 
     Brightness is relative to full scale; row 0 is at the top. If other targets lie in the same
     plane, the picture shows them too, because a beam may extend onto them.
@@ -28,10 +28,10 @@ class BeamPicture:
     target
         The target.
     picture, background
-        Brightness with the beam, and without it as far as the frame reveals, (H, W).
+        Brightness with the beam, and estimated brightness without it, (H, W).
     light
-        Their difference, as paint of the usual reflectance would show it, (H, W); interpolated on
-        marks.
+        Difference of ``picture`` and ``background``, as paint with the usual reflectance would show
+        it, (H, W); interpolated on marks.
     mask
         Pixels of this beam, including its tails, (H, W).
     paint
@@ -73,9 +73,9 @@ def with_centroid(
     Parameters
     ----------
     placed, target
-        A spot, and the target that it lies on.
+        A spot, and the target on which it lies.
     picture, background
-        Its face.
+        Picture and background of the face.
     own
         The user-defined centroid function.
 

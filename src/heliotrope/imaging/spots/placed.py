@@ -1,4 +1,4 @@
-"""The position of a spot on its target, with the covariance of spot, view and survey."""
+"""Position of a spot on its target, with the covariance due to spot, view and survey."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ class PlacedSpot:
     spot
         Shape of the spot, on its face.
     target
-        The target under its centroid; None if it is beside all targets.
+        The target on which the centroid lies; None if it is beside all targets.
     plane
         Metres to the right of and above the target centre (or the face origin if there is no
         target), (2,).
@@ -33,8 +33,9 @@ class PlacedSpot:
     pixel
         Pixel of the frame, (2,).
     flux
-        Light divided by the frame's exposure and gain, full scales m² per second at gain 1, which
-        makes frames from one camera comparable; NaN if exposure or gain is unknown.
+        Light divided by the frame's exposure and gain (unit: full scale times m² per second, at a
+        gain of one), which makes frames from one camera comparable; NaN if exposure or gain is
+        unknown.
     """
 
     spot: Spot
@@ -58,7 +59,7 @@ def place(picture: Rectified, spot: Spot, gathered: float = float("nan")) -> Pla
     Parameters
     ----------
     picture
-        The face that the spot was found on.
+        The face on which the spot was found.
     spot
         The spot.
     gathered

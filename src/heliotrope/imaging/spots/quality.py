@@ -1,4 +1,4 @@
-"""Whether a spot can be trusted: named reasons against it, each with its measured value."""
+"""Assess whether a spot can be trusted: named reasons against it, with measured values."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,20 +37,20 @@ class Limits:
     Attributes
     ----------
     second_spot
-        Largest power of another spot on the same target, relative to the first.
+        Largest power of a second spot on the same target, relative to the first spot.
     edge
-        Brightness at the target border relative to the peak. Within this limit the light beyond the
-        border is estimated to about a third of the shift that it causes.
+        Largest brightness at the target border relative to the peak. Within this limit, the shift
+        caused by the light beyond the border can be corrected to about a third.
     cut
-        Largest such shift, m.
+        Largest shift caused by the light beyond the border, m.
     clipped
-        Fraction of the light in clipped pixels.
+        Largest fraction of the light in clipped pixels.
     mark_contrast
-        Brightness of the marks relative to their surroundings.
+        Largest brightness of the marks relative to their surroundings.
     power
         Smallest power relative to the expected power.
     surprise
-        Number of standard deviations that a beam may exceed its expected power, length or
+        Number of standard deviations by which a beam may exceed its expected power, length or
         width.
     skewness
         Largest skewness; two overlapping beams are more skewed than the beam of one heliostat (98 %
@@ -62,14 +62,14 @@ class Limits:
     blur
         Largest blur of the marks, m.
     covered
-        Fraction of a spot that is covered by marks.
+        Largest fraction of a spot that is covered by marks.
     deviation
         Standard deviation of the centroid along its worse axis, m.
     free
         Smallest fraction of the face that is free of beams.
     unexplained
-        Fraction of the face, outside its spots, that is brighter or darker than it should be:
-        shadows with several edges, stray light, obstacles.
+        Largest fraction of the face, outside its spots, that is brighter or darker than it should
+        be because of shadows with several edges, stray light or obstacles.
     """
 
     second_spot: float = 0.15
@@ -98,15 +98,15 @@ class Expectation:
     power
         Power as in `Spot`, relative to the ambient light, m²; NaN if unknown.
     flux
-        Flux as in `PlacedSpot`, full scales m²/s at gain 1; NaN if unknown. It depends on the sun
-        alone and is preferred to ``power`` if the exposure and gain of a frame are known.
+        Flux as in `PlacedSpot`, full scales m²/s at gain 1; NaN if unknown. The flux depends on the
+        sun alone and is preferred to ``power`` if the exposure and gain of a frame are known.
     length, width
-        Standard deviations along its major and minor axis, m; NaN if unknown.
+        Standard deviations along the beam's major and minor axes, m; NaN if unknown.
     deviation
         Relative standard deviation of power, flux, length and width.
     place
-        Expected position, metres to the right of and above the target centre, (2,), or None; of
-        several spots the nearest is taken.
+        Expected position, metres to the right of and above the target centre, (2,); None if
+        unknown. If there are several spots, the nearest is chosen.
     """
 
     power: float = float("nan")
@@ -160,7 +160,8 @@ def judge(
     spots
         Spots on this target, the intended spot first.
     deviation
-        Standard deviation of its centroid along its worse axis, including that of the target, m.
+        Standard deviation of the first spot's centroid along its worse axis, including that of the
+        target, m.
     free
         Fraction of the face that is free of beams.
     limits
@@ -221,7 +222,7 @@ def judge(
 
 
 def _of_power(spot: Spot, flux: float, limits: Limits, expectation: Expectation) -> list[Reason]:
-    """Judge the power of a spot: too little suggests a cloud, too much a second beam."""
+    """Assess the power of a spot: too little suggests a cloud, too much a second beam."""
     share = flux / expectation.flux
     if not np.isfinite(share):
         share = spot.power / expectation.power
@@ -241,7 +242,7 @@ def _of_power(spot: Spot, flux: float, limits: Limits, expectation: Expectation)
 
 
 def _of_frame(target: FoundTarget, limits: Limits) -> list[Reason]:
-    """Judge the frame by its marks: stray light, focus, shake."""
+    """Assess stray light, focus and shake of the frame from its marks."""
     used = [m for m in target.marks if m.used and np.isfinite(m.contrast)]
     if not used:
         return []
@@ -255,7 +256,7 @@ def _of_frame(target: FoundTarget, limits: Limits) -> list[Reason]:
         text = f"the marks' edges are {float(blur.min()):.2f} m soft"
         reasons.append(Reason("out of focus", float(blur.min()), limits.blur, text))
     motion = float(blur.max() / max(blur.min(), 1e-9))
-    # Blur below a mark's stroke cannot be seen and moves no centroid.
+    # Blur smaller than a mark's stroke cannot be seen and does not move the centroid.
     if motion > limits.motion and float(blur.max()) > 0.4 * limits.blur:
         text = f"the marks are {motion:.1f} times as soft in one direction: the camera moved"
         reasons.append(Reason("moved", motion, limits.motion, text))

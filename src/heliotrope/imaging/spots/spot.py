@@ -1,4 +1,4 @@
-"""Spots on a face: which pixels belong to each spot, and where its centroid is."""
+"""Find spots on a face: which pixels belong to each spot, and where its centroid is."""
 
 from dataclasses import dataclass
 
@@ -11,36 +11,39 @@ from heliotrope.imaging.spots._top_kernels import number_tops
 from heliotrope.imaging.spots.background import Background, smooth
 from heliotrope.imaging.targets.rectify import Mask, Rectified
 
-#: Minimum peak of a beam: in deviations of the background's residuals, and relative to it.
+#: Minimum peak of a beam, in standard deviations of the background residuals, and relative to the
+#: background.
 _SEED, _SEED_PART = 8.0, 0.06
-#: A beam ends where it falls below this many deviations,
+#: A beam ends where it falls below this many standard deviations,
 _FOOT = 5.0
-#: and below this share of its peak, however faint the paint's structure.
+#: and below this fraction of its peak, however faint the structure of the paint.
 _FOOT_PART = 0.03
-#: A neck is narrower, either side, than this share of a beam's width at half its height.
+#: A neck is narrower, on either side, than this fraction of a beam's width at half its height.
 _NECK = 0.3
-#: Growth of a beam beyond its foot to include its tails, in its radius.
+#: A beam is extended beyond its foot by this fraction of its radius, to include its tails.
 _TAIL = 0.15
-#: Paint darker than this share of the usual one does not measure light.
+#: Paint darker than this fraction of the usual paint is not used to measure light.
 _DARKEST = 0.4
-#: Two tops are two beams if brightness between them falls by this share of the lower one (facets
-#: of one heliostat reach 0.16 at most on a hundred measured beams of Jülich),
+#: Two tops are two beams if the brightness between them falls by this fraction of the lower top (on
+#: a hundred measured beams at Jülich, facets of one heliostat reach at most 0.16),
 _DIP = 0.18
-#: and by this many deviations of the background's residuals.
+#: and by this many standard deviations of the background residuals.
 _DIP_LEAST = 4.0
-#: Skewness is measured where a beam is brighter than this share of its peak.
+#: Skewness is measured where a beam is brighter than this fraction of its peak.
 _BODY = 0.1
-#: Smallest beam, m²; the sun's image at 20 m is 0.03.
+#: Smallest area of a beam, m²; the sun's image at 20 m has 0.03 m².
 _SMALLEST = 0.03
-#: Share of the difference between centroids over foot and tails that counts as error.
+#: Fraction of the difference between the centroids with and without the tails that counts as error.
 _TAIL_SHARE = 0.5
-#: Light below the foot is not seen. With the foot at the share φ of the peak, it moves the
-#: centroid by about this times φ^1.5 deviations of the beam. Measured on 400 simulated beams over
-#: photographs of empty targets, for peaks of 0.25 to 2 times the background.
+#: Light below the foot is not measured. With the foot at the fraction φ of the peak, that light
+#: moves the centroid by about this factor times φ^1.5 times the beam's standard deviation. The
+#: factor was measured on 400 simulated beams over photographs of empty targets, for peaks of 0.25
+#: to 2 times the background.
 _HIDDEN = 0.6
-#: Error of the estimated light beyond the border, as a share of the shift it can make at most.
+#: Error from the estimated light beyond the border, as a fraction of the largest shift that this
+#: light can cause.
 _CUT_SHARE = 0.4
-#: Shift of a centroid by clipping of the brightest part, in the beam's radius.
+#: Shift of a centroid when the brightest part is clipped, as a fraction of the beam radius.
 _CLIP_SHARE = 0.15
 
 
@@ -51,14 +54,15 @@ class Spot:
     Attributes
     ----------
     centroid
-        Centroid of its light, plane coordinates of the face, m, (2,); includes the estimated light
-        beyond the target's border.
+        Centroid of the beam's light, including the estimated light beyond the target border, in
+        plane coordinates of the face, m, (2,).
     covariance
-        Covariance of the centroid, m², (2, 2), from background, noise, tails, border and clipping.
+        Covariance of the centroid, m², (2, 2), due to background, noise, tails, border and
+        clipping.
     second_moments
-        Second moments of its light on the target about the centre of that light, m², (2, 2).
+        Second moments of the light on the target about its own centre, m², (2, 2).
     power
-        Sum of its brightness relative to that of the background, m².
+        Sum of the beam's brightness relative to that of the background, m².
     peak
         Largest brightness above the background, as a fraction of full scale.
     contrast
@@ -66,21 +70,22 @@ class Spot:
     deviation
         Standard deviation of the background residuals, as a fraction of full scale.
     clipped
-        Fraction of its light in clipped pixels.
+        Fraction of the light that is in clipped pixels.
     edge
-        Brightness at the border of the visible target, relative to its peak.
+        Brightness at the border of the visible target, relative to the peak.
     covered
-        Fraction of its area that marks cover.
+        Fraction of the spot's area that marks cover.
     area
         m².
     region
-        Its pixels, (H, W), including tails.
+        Mask of the spot's pixels, including tails, (H, W).
     cut
         Shift of ``centroid`` due to the light beyond the border, m.
     light
-        Sum of its brightness, full scales m².
+        Sum of the beam's brightness, in full scales times m².
     skewness
-        Norm of the third moments of its core, in units of its standard deviations; 0 if symmetric.
+        Norm of the third moments of the beam's core, in units of its standard deviations; 0 if
+        symmetric.
     """
 
     centroid: FloatArray
@@ -101,9 +106,9 @@ class Spot:
 
     @property
     def axes(self) -> tuple[float, float, float]:
-        """Standard deviations along the major and minor axis, m, and the angle of the major axis.
+        """Standard deviations along the major and minor axes, m, and angle of the major axis, rad.
 
-        The angle is counterclockwise from the right, rad.
+        The angle is counterclockwise from the right.
         """
         values, vectors = np.linalg.eigh(self.second_moments)
         major = vectors[:, 1]
@@ -123,7 +128,7 @@ def find_spots(picture: Rectified, background: Background) -> list[Spot]:
     foot = _FOOT * background.deviation
     level = float(np.median(background.values[picture.paint]))
     seed = max(_SEED * background.deviation, _SEED_PART * level)
-    # Tops are broad; every third pixel shows them.
+    # Tops are broad, so every third pixel suffices to find them.
     small = np.ascontiguousarray(soft[::3, ::3])
     coarse = np.zeros(small.shape, dtype=np.int32)
     least = _DIP_LEAST * background.deviation
@@ -157,7 +162,8 @@ def _core(soft: Image, owned: Mask, foot: float) -> Mask:
     neck = int(_NECK * breadth)
     if neck < 2:
         return np.asarray(core)
-    # Opening by a disc: pixels farther from the rim than its radius, and those near them.
+    # Morphological opening by a disc keeps the pixels farther from the rim than the disc's radius,
+    # and pixels near these.
     inner = cv2.distanceTransform(core.astype(np.uint8), cv2.DIST_L2, 5) <= neck
     opened = cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 5) <= neck
     _, labels = cv2.connectedComponents((core & opened | half).astype(np.uint8), connectivity=4)
@@ -165,9 +171,9 @@ def _core(soft: Image, owned: Mask, foot: float) -> Mask:
 
 
 def beam_light(picture: Rectified, background: Background) -> Image:
-    """Return the light of beams, as paint of the usual reflectance would show it.
+    """Return the light of beams, as paint with the usual reflectance would show it.
 
-    On marks it is interpolated from their surroundings.
+    On marks the light is interpolated from their surroundings.
     """
     added = picture.values - background.values
     if background.reflectance is not None:
@@ -186,7 +192,7 @@ def _measure(
     core: Mask,
     tops: Image,
 ) -> Spot:
-    """Return the moments of one beam with their covariance."""
+    """Return one beam, with its moments and the covariance of its centroid."""
     import cv2
 
     step = picture.step
@@ -284,14 +290,14 @@ def _from_background(
     dy: FloatArray,
     total: float,
 ) -> FloatArray:
-    """Return the covariance of a centroid by background fit, its residuals, and noise.
+    """Return a centroid's covariance due to the background fit, its residuals, and noise.
 
     With light w = value − b, the centroid moves by −Σ (x − c) δb / Σ w.
     """
     inside = region[box].astype(np.float64)
     arms = np.stack([inside * dx[None, :], inside * dy[:, None]]) / max(total, 1e-12)
     spread = np.einsum("iyx,jyx->ij", arms, arms)
-    # The derivatives of the fit are known on a coarser grid.
+    # The derivatives of the fit are known only on a coarser grid.
     stride = background.stride
     rows = np.arange(stride // 2, picture.shape[0], stride)
     columns = np.arange(stride // 2, picture.shape[1], stride)
@@ -307,8 +313,8 @@ def _from_background(
 def pixel_variance(picture: Rectified, background: Background) -> float:
     """Return the variance of a pixel's light, as if pixels were independent of each other.
 
-    Residuals of the background fit are correlated over patches, so each counts for all pixels of a
-    patch.
+    Residuals of the background fit are correlated over patches, so each residual counts for all
+    pixels of a patch.
     """
     patch = max(background.patch / picture.step**2, 1.0)
     return patch * background.deviation**2 + background.noise**2

@@ -1,6 +1,6 @@
 # mypy: disable-error-code="no-untyped-call, untyped-decorator"
 # mypy: allow-untyped-defs
-"""Compiled: light sampled from a plane, ambient light, and the exposure of a sensor."""
+"""Compiled kernels: light sampled from a plane, ambient light, and exposure of a sensor."""
 
 import math
 
@@ -13,13 +13,13 @@ from heliotrope.jit import INLINED, OPTIONS
 
 Image = npt.NDArray[np.float32]
 
-#: Finest subdivision of a pixel, each way.
+#: Finest subdivision of a pixel in each direction.
 FINEST = 16
 
 
 @njit(**INLINED)
 def _bilinear(grid, x, y):
-    """Return ``grid`` at column x and row y. Its border must be 0, like everything beyond."""
+    """Return ``grid`` at column x and row y; the grid's border must be 0."""
     x = min(max(x, 0.0), grid.shape[1] - 1.000001)
     y = min(max(y, 0.0), grid.shape[0] - 1.000001)
     j, i = int(x), int(y)
@@ -38,16 +38,16 @@ def sample_plane(
     step: float,
     out: Image,
 ) -> None:
-    """Average a field on the plane over each pixel, into ``out``.
+    """Average a field on the plane over each pixel, and store the result in ``out``.
 
     Parameters
     ----------
     u, v
         Position on the plane seen by each pixel's centre, m, (H, W).
     share
-        0 where a pixel does not see the plane, (H, W).
+        Fraction of each pixel that sees the plane, (H, W); pixels with 0 are skipped.
     grid, origin, step
-        The field, bilinear between samples and 0 beyond; its first sample is at ``origin``.
+        The field, bilinear between samples and 0 beyond them; the first sample is at ``origin``.
     out
         (H, W).
     """
@@ -59,7 +59,7 @@ def sample_plane(
 
 @njit(**OPTIONS)
 def _sample(u, v, share, grid, x0, y0, per, out):
-    """`sample_plane` of a grid with a border of 0; ``per`` is samples per metre."""
+    """Perform `sample_plane` for a grid with a border of 0; ``per`` is samples per metre."""
     height, width = out.shape
     for i in range(height):
         up, down = max(i - 1, 0), min(i + 1, height - 1)
@@ -79,7 +79,7 @@ def _sample(u, v, share, grid, x0, y0, per, out):
                 -reach < x < grid.shape[1] - 1 + reach and -reach < y < grid.shape[0] - 1 + reach
             ):
                 continue
-            # Half a sample apart, so that the kinks of the field are seen.
+            # The points are half a sample apart, so that kinks of the field are not missed.
             n = min(FINEST, max(2, math.ceil(2.0 * reach)))
             total = 0.0
             for k in range(n):
@@ -94,9 +94,9 @@ def _sample(u, v, share, grid, x0, y0, per, out):
 def ambient_field(u, v, share, terms, out):
     """Compute the relative ambient light of each pixel, gradient times shadow, (H, W).
 
-    ``terms`` are the gradient right and up (1/m), then for the edge of the shadow a point (m), the
-    unit normal into the shadow, the breadth of the ramp (m) and the light left in the shadow
-    (1: no shadow).
+    ``terms`` starts with the gradient to the right and up (1/m). For the edge of the shadow follow
+    a point (m), the unit normal into the shadow, the breadth of the ramp (m) and the fraction of
+    the light left in the shadow (1 for no shadow).
     """
     gx, gy, px, py, nx, ny, soft, remaining = terms
     height, width = out.shape
@@ -127,11 +127,11 @@ def expose(level, noise, read_noise, per_electron, offset, curve, steps, out):
     noise
         Standard normal numbers, (N,).
     read_noise
-        Electrons.
+        Read noise, electrons.
     per_electron, offset
-        Fractions of full scale.
+        Reading per electron and in darkness, as fractions of full scale.
     curve
-        Encoding table for fractions of full scale from 0 to 1, in equal steps; empty: linear.
+        Encoding table for fractions of full scale from 0 to 1, in equal steps; empty for linear.
     steps
         Greatest reading: 255 or 4095.
     out
@@ -140,7 +140,7 @@ def expose(level, noise, read_noise, per_electron, offset, curve, steps, out):
     clipped = 0
     for i in range(len(level)):
         mean = max((float(level[i]) - offset) / per_electron, 0.0)
-        # The Poisson distribution, approximated by a normal distribution of the same variance.
+        # The Poisson distribution is approximated by a normal distribution with the same variance.
         share = (
             offset + (mean + math.sqrt(mean + read_noise * read_noise) * noise[i]) * per_electron
         )

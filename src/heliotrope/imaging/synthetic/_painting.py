@@ -18,17 +18,19 @@ from heliotrope.optics.coverage import coverage
 
 Image = npt.NDArray[np.float32]
 
-#: Spacing of the pixels at which the lens is inverted; cubic splines between err by 1e-6 px.
+#: Spacing of the pixels at which the lens is inverted; interpolation by cubic splines has an error
+#: of 1e-6 px.
 _KNOTS = 16
-#: Length of pieces of polygons' edges, px; a lens bends them by less than 1e-4 px.
+#: Length of the pieces into which polygon edges are cut, px; a lens bends a piece by less than 1e-4
+#: px.
 _PIECE = 4.0
-#: Subdivision of pixels for blurring paint, and size of a tile, px, each way.
+#: Subdivision of pixels for blurring paint, and size of a tile, px, in each direction.
 _FINE, _TILE = 5, 64
 
 
 @dataclass(frozen=True)
 class Plane:
-    """A target's plane in the frame: positions (m), visible fraction, reflectance, (H, W)."""
+    """A target's plane in the frame: positions, m, visible fraction and reflectance, (H, W)."""
 
     u: Image
     v: Image
@@ -38,7 +40,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class PaintedScene:
-    """The part independent of light and beams: planes, and the sky's fraction and light."""
+    """The part of a scene that is independent of light and beams: target planes and sky."""
 
     planes: tuple[Plane, ...]
     sky: Image
@@ -46,7 +48,7 @@ class PaintedScene:
 
 @dataclass(frozen=True)
 class SceneKey:
-    """A camera and targets as a cache key, compared by their effect on the picture."""
+    """A camera and targets as a cache key; equal keys have the same effect on the picture."""
 
     key: tuple[object, ...]
     camera: Camera = field(compare=False)
@@ -68,7 +70,7 @@ def _key(camera: Camera, targets: tuple[Target, ...]) -> tuple[object, ...]:
 
 
 def painted_scene(scene: Scene) -> PaintedScene:
-    """Return the constant part of a scene, cached for the last four combinations.
+    """Return the constant part of a scene; the last four results are cached.
 
     Raises
     ------
@@ -109,7 +111,7 @@ def _areas(
         areas.append(np.minimum(soft_coverage([border], shape, blur), free))
         free -= areas[-1]
     for target in view.targets:
-        # A wall gets the fraction left by everything in front of it.
+        # A wall covers the fraction that is left by everything in front of it.
         outline = _projected(camera, target, _wall(target, wall))
         behind = soft_coverage([outline], shape, blur) - (1.0 - free)
         walls.append(np.maximum(behind, np.float32(0.0)))
@@ -131,9 +133,9 @@ def _check_seen(camera: Camera, target: Target) -> None:
 def soft_coverage(polygons: list[FloatArray], shape: tuple[int, int], blur: float) -> Image:
     """Return the fraction of each pixel that polygons cover after a Gaussian blur, (H, W).
 
-    A lens blurs the image before pixels sample it; blurring pixels afterwards would move edges by
-    up to 0.02 px, depending on their subpixel position. Polygons (K, 2) and ``blur``, a standard
-    deviation, are in pixels.
+    The blur is applied before pixels sample the image, as a lens does. Blurring pixels afterwards
+    would move edges by up to 0.02 px, depending on their subpixel position. Polygons (K, 2) and
+    ``blur``, a standard deviation, are in pixels.
     """
     import cv2
 
@@ -162,7 +164,7 @@ def soft_coverage(polygons: list[FloatArray], shape: tuple[int, int], blur: floa
 
 @lru_cache(maxsize=4)
 def _plane_map(view: SceneKey) -> tuple[Image, Image]:
-    """Return the positions that pixels see, metres right of and above the centre, (H, W) each."""
+    """Return the positions that pixels see, m right of and above the centre, (H, W) each."""
     from scipy.interpolate import RectBivariateSpline
 
     camera, target = view.camera, view.targets[0]
@@ -187,7 +189,7 @@ def _plane_map(view: SceneKey) -> tuple[Image, Image]:
 
 
 def _projected(camera: Camera, target: Target, polygon: FloatArray) -> FloatArray:
-    """Return a polygon (K, 2) in the plane, m, as pixels (L, 2), bent by the lens."""
+    """Return a polygon (K, 2) in the plane, m, as pixels (L, 2), distorted by the lens."""
     ends = np.roll(polygon, -1, axis=0)
     rough = project(camera, target.point(np.stack([polygon, ends])))
     if not np.isfinite(rough).all():
@@ -213,7 +215,7 @@ def _wall(target: Target, wall: tuple[float, float, float, float]) -> FloatArray
 def _texture(
     rng: np.random.Generator, low: FloatArray, high: FloatArray, coarse: float, amplitude: float
 ) -> tuple[FloatArray, float]:
-    """Return smooth noise around 1 over a rectangle, of grain size ``coarse`` (m), and its step."""
+    """Return smooth noise around 1 over a rectangle, of grain size ``coarse`` m, and its step."""
     from scipy.ndimage import zoom
 
     columns, rows = (np.ceil((high - low) / coarse).astype(int) + 4).tolist()
@@ -283,7 +285,7 @@ def _paint_target(
 
 
 def mark_shapes(target: Target, mark: Mark) -> list[FloatArray]:
-    """Return a mark's dark polygons, metres right of and above the target's centre."""
+    """Return a mark's dark polygons, in metres right of and above the target's centre."""
     point = target.plane_coordinates(mark.point)
     return [point + shape for shape in polygons(mark)]
 
@@ -303,7 +305,7 @@ def _paint_wall(
     for _ in range(around.clutter):
         half = 0.5 * np.exp(rng.uniform(np.log(0.05), np.log(1.5), 2))
         box = np.array([(-1, 1), (1, 1), (1, -1), (-1, -1)]) * half
-        # Beside the target, which would hide them.
+        # The boxes stand beside the target, which would otherwise hide them.
         middle = rng.uniform(near_low, near_high)
         k = int(np.argmax(np.abs(middle) / reach))
         if abs(middle[k]) < 0.55 * reach[k]:
@@ -319,6 +321,6 @@ def _sky(shape: tuple[int, int], around: Surroundings) -> Image:
     rng = np.random.default_rng([3, around.seed])
     rough = rng.standard_normal((8, 10)).astype(np.float32)
     clouds = cv2.resize(rough, shape[::-1], interpolation=cv2.INTER_CUBIC)
-    # Brighter towards the horizon.
+    # The sky is brighter towards the horizon.
     height = np.linspace(0.85, 1.15, shape[0], dtype=np.float32)[:, None]
     return np.maximum(height * (1.0 + np.float32(around.texture) * np.asarray(clouds)), 0.0)

@@ -51,10 +51,10 @@ __all__ = [
     "render",
 ]
 
-#: Blue, green, red of beams and of ambient light in colour frames, relative to grey.
+#: Blue, green and red of beams and of ambient light in colour frames, relative to grey.
 BEAM_TINT, AMBIENT_TINT = (0.80, 1.0, 1.08), (1.15, 1.0, 0.88)
-#: A mark is lit if beams add this share of the ambient light, and covered if its contrast is below
-#: this many standard deviations of the noise.
+#: A mark is lit if beams add this fraction of the ambient light, and covered if its contrast is
+#: below this many standard deviations of the noise.
 LIT, COVERED = 0.5, 3.0
 
 
@@ -70,13 +70,14 @@ class BeamTruth:
         Centre of the energy on the plane, including light beyond the border: metres to the right of
         and above the target centre (2,), ENU metres (3,), and the pixel of that point (2,).
     centroid_on_target, pixel_on_target
-        The same for the energy that falls on the target; NaN if none does.
+        Centroid and pixel of the energy that falls on the target; NaN if none does.
     share_on_target
         Fraction of the energy on the target.
     share_clipped
-        Fraction of its light in the frame that is on clipped pixels.
+        Fraction of the beam's light in the frame that falls on clipped pixels.
     peak
-        Pixel value at its brightest point, in full scales, before clipping.
+        Pixel value at the brightest point of the beam, as a fraction of full scale, before
+        clipping.
     """
 
     target: str
@@ -99,13 +100,14 @@ class MarkTruth:
     target, name
         Names of the target and of the mark.
     pixel
-        Pixel of its point, (2,).
+        Pixel of the mark's point, (2,).
     in_frame
         Whether the pixel is in the frame.
     light
         Mean flux of the beams on the mark relative to the ambient light.
     contrast
-        Mean pixel value of the paint minus that of the mark, after clipping, in full scales.
+        Mean pixel value of the paint minus that of the mark, after clipping, as a fraction of full
+        scale.
     lit
         Whether ``light`` is above one half.
     covered
@@ -133,10 +135,10 @@ class Rendered:
     beams, marks
         Truth of beams and marks, in the order of the scene.
     clipped
-        Fraction of the pixel values at full scale.
+        Fraction of the pixel values that are at full scale.
     level
-        Pixel values without noise, clipping and encoding, in full scales, float32, in the shape of
-        the frame; None unless requested.
+        Pixel values without noise, clipping and encoding, as fractions of full scale, float32, in
+        the shape of the frame; None unless requested.
     """
 
     frame: Frame
@@ -154,7 +156,7 @@ def render(
     time: datetime | None = None,
     level: bool = False,
 ) -> Rendered:
-    """Return a frame of a scene with its ground truth; equal seeds give equal noise.
+    """Return a frame of a scene with its ground truth; equal seeds produce equal noise.
 
     Parameters
     ----------
@@ -166,7 +168,7 @@ def render(
     name, time
         Name and time of the frame.
     level
-        Whether to return the pixel values without noise too.
+        Whether to return the pixel values without noise as well.
 
     Raises
     ------
@@ -241,7 +243,7 @@ def _beam_image(
     )
     light = np.zeros_like(u)
     if light.size:
-        # A pixel sees at most eight samples each way.
+        # A pixel sees at most eight samples in each direction.
         pixel = float(np.abs(np.gradient(u, axis=1)).max()) if u.shape[1] > 1 else 0.0
         beam = thrown.beam.coarser(int(pixel / (8.0 * thrown.beam.step)))
         sample_plane(u, v, share, beam.flux, beam.origin, beam.step, light)
@@ -249,7 +251,7 @@ def _beam_image(
 
 
 def _through_lens(scene: Scene, ambient: Image, beams: Image) -> Image:
-    """Return readings without noise and clipping, in full scales."""
+    """Return readings without noise and clipping, as fractions of full scale."""
     lens, sensor = scene.lens, scene.sensor
     if sensor.colour:
         light = np.stack(
@@ -289,7 +291,7 @@ def _bell(sigma: float) -> FloatArray:
 
 
 def point_spread(lens: LensEffects) -> FloatArray:
-    """Return the kernel (K, K) of a lens's disk or Gaussian with its shake; symmetric, sum 1."""
+    """Return the symmetric blur kernel (K, K), with sum 1, of a lens and its shake."""
     from scipy.signal import convolve2d
 
     spread = np.ones((1, 1))
@@ -342,7 +344,7 @@ def _expose(sensor: Sensor, level: Image, seed: int) -> tuple[Pixels, float]:
 
 
 def _srgb(share: FloatArray) -> FloatArray:
-    """Encode linear light 0 to 1 (IEC 61966-2-1)."""
+    """Encode linear light, 0 to 1, with the sRGB curve (IEC 61966-2-1)."""
     return np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1.0 / 2.4) - 0.055)
 
 
@@ -386,7 +388,7 @@ def _mark_truths(scene: Scene, thrown: list[Thrown]) -> tuple[MarkTruth, ...]:
     tints = (AMBIENT_TINT, BEAM_TINT) if scene.sensor.colour else ((1.0,), (1.0,))
     for target in scene.targets:
         for mark in target.marks:
-            # A grid over the mark's extent, paint and strokes alike.
+            # The grid covers the extent of the mark, both paint and strokes.
             corners = np.concatenate(mark_shapes(target, mark))
             low, high = corners.min(axis=0), corners.max(axis=0)
             part = (np.arange(5) + 0.5) / 5
@@ -434,7 +436,7 @@ def _mark_truth(
 
 
 def _relative_ambient(scene: Scene, places: FloatArray) -> FloatArray:
-    """Return gradient and shadow at places of the plane (..., 2), as the frame shows them."""
+    """Return the relative ambient light (gradient, shadow) at positions (..., 2) of the plane."""
     u, v = (np.ascontiguousarray(places[..., k], dtype=np.float32) for k in (0, 1))
     out = np.empty_like(u)
     ambient_field(u, v, np.ones_like(u), _ambient_terms(scene), out)

@@ -26,11 +26,11 @@ class Paint:
     seam, seam_width
         Reflectance of the gaps between sheets, and their width, m.
     wear
-        Standard deviation of the reflectance over decimetres, relative.
+        Relative standard deviation of the reflectance over decimetres.
     stains, stain
         Number of stains, and largest relative loss of reflectance in a stain.
     patch
-        Reflectance of a repaired patch; 0: no patch.
+        Reflectance of a repaired patch; 0 for no patch.
     seed
         Seed for the positions of stains, wear and patch.
     """
@@ -72,7 +72,7 @@ class Surroundings:
     clutter
         Number of light and dark boxes on the wall.
     seed
-        Seed for their positions.
+        Seed for the positions of the boxes.
     """
 
     wall: tuple[float, float, float, float] = (1.5, 1.5, 3.0, 30.0)
@@ -136,8 +136,8 @@ class LensEffects:
     veil
         Stray light everywhere, as a fraction of the frame's mean light.
     ghost, ghost_at, ghost_radius
-        A reflection in the lens: peak as a fraction of full scale, position and standard deviation,
-        px.
+        A reflection in the lens: its peak as a fraction of full scale, its position and its
+        standard deviation, px.
     """
 
     defocus: float = 0.6
@@ -180,23 +180,25 @@ class Sensor:
     Attributes
     ----------
     electrons
-        Electrons at full scale and gain 1.
+        Number of electrons at full scale and gain 1.
     sensitivity
-        Electrons per second and W/m² on white; 6000 and 1 ms fill the scale at 1667 W/m².
+        Electrons per second per W/m² on white paint. With 6000 and 1 ms, full scale is reached at
+        1667 W/m².
     exposure
         s.
     gain
-        Relative gain: electrons / gain fill the scale.
+        Relative gain; full scale is reached at ``electrons`` / ``gain`` electrons.
     read_noise
-        Standard deviation, electrons.
+        Standard deviation of the read noise, electrons.
     offset
         Pixel value in darkness, as a fraction of full scale.
     bits
-        8, or 12 spread over 16 so that 4095 becomes 65535.
+        Bits per value: 8, or 12 spread over 16 so that 4095 becomes 65535.
     srgb
         Whether to encode by the sRGB curve instead of linearly.
     colour
-        Whether to produce blue, green, red with light of two tints, instead of grey.
+        Whether to produce blue, green and red, with different tints of beams and ambient light,
+        instead of grey.
     """
 
     electrons: float = 10_000.0
@@ -266,7 +268,7 @@ class Scene:
     targets
         Targets with their marks, except pictures, which cannot be drawn.
     beams
-        `Thrown`, or tuples of its arguments.
+        Beams as `Thrown`, or as tuples of its arguments.
     ambient
         Irradiance of the targets without beams, W/m².
     gradient
@@ -277,7 +279,7 @@ class Scene:
     cloud
         Factor on all beams; 1 under a clear sky.
     paint, surroundings, lens, sensor
-        See their classes.
+        See the classes of these names.
     """
 
     camera: Camera
@@ -312,12 +314,12 @@ class Scene:
 
 
 def exposed(scene: Scene, peak: float = 0.8) -> Scene:
-    """Return the scene with the exposure set so that its brightest beam reads ``peak``.
+    """Return the scene with the exposure set so that the brightest beam reads ``peak``.
 
     Parameters
     ----------
     scene
-        Scene with beams; with ambient light alone the paint reads ``peak``.
+        Scene with beams; if it has none, the exposure is set so that the paint reads ``peak``.
     peak
         Pixel value of the target paint at the peak of the strongest beam, as a fraction of full
         scale.
@@ -340,11 +342,12 @@ def example_target(
 ) -> Target:
     """Return a square target that faces north, with eight marks just inside its border.
 
-    Corner marks are at its four corners and tees half-way between. For a side of 8 m they measure
-    0.6 m with strokes of 0.12 m, otherwise in proportion.
+    Corner marks are at the four corners, with T-shaped marks half-way between them. For a target
+    side of 8 m the marks measure 0.6 m and have strokes of 0.12 m; otherwise their size is in
+    proportion.
     """
     middle, half = as_float(center), 0.5 * side
-    # Looking south at it, west is on the right.
+    # Looking south at the target, west is on the right.
     right, up = np.array([-1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
     inset = half - 0.0375 * side
     size, stroke = 0.075 * side, 0.015 * side
@@ -387,7 +390,8 @@ def example_camera(
     size
         Width and height of a frame, pixels.
     side, below
-        Angles off the target normal, to the right as seen from its front and downwards, rad.
+        Angles off the target normal, to the right as seen from the front of the target and
+        downwards, rad.
     roll
         Rotation about the line of sight, rad.
     fill

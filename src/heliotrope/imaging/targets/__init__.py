@@ -1,11 +1,11 @@
-"""Finds targets in frames by their marks, and teaches a camera its targets.
+"""Find targets in frames by their marks, and define marks that a camera can recognise.
 
 - `marks` and `detection`: drawings of marks, and candidates for them in a frame.
-- `constellation` and `refinement`: which candidate is which mark, and its exact position.
+- `constellation` and `refinement`: assign candidates to marks, and locate the marks exactly.
 - `finding`: targets in a frame, or why they were not found, through successive `attempt`s. `view`
-  maps a target plane to a frame, `rectify` shows it from the front.
-- `teaching` and `click_page`: marks and camera from points that a user clicks. `sights`: how well a
-  camera sees its targets.
+  maps a target plane to a frame, and `rectify` shows the plane from the front.
+- `teaching` and `click_page`: marks and a camera from points that a user clicks. `sights`: how well
+  a camera sees its targets.
 
 Begin with `find_targets`.
 """

@@ -1,4 +1,4 @@
-"""One attempt to locate a face in a frame: its marks, the resulting view, and reasons for doubt."""
+"""One attempt to locate a face in a frame: marks, the resulting view, and reasons for doubt."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,40 +18,41 @@ from heliotrope.imaging.targets.view import Face, FaceView, fit_view, homography
 
 Pictures = Mapping[str, FloatArray]
 
-#: Standard deviation of a mark's place on its target, by survey and paint, m.
+#: Standard deviation of a mark's position on its target, due to survey and paint, m.
 SURVEY = 0.005
 #: Standard deviation of a tag's corners relative to each other, m.
 PRINT = 0.001
-#: Minimum correlation of a mark; least share of the variance that its drawing explains (without and
-#: with a code that was read); greatest brightness over its surroundings.
+#: Minimum correlation of a mark; minimum fraction of the variance that its drawing explains
+#: (without and with a code that was read); maximum brightness relative to its surroundings.
 LIKE, EXPLAINED, EXPLAINED_READ, CONTRAST = 0.45, 0.65, 0.3, 0.93
-#: A mark this many standard deviations from the place given by the others is not used.
+#: A mark is not used if it is this many standard deviations from where the other marks predict it.
 STRAY = 5.0
-#: Maximum distortion of one mark against its drawing, of the size of all marks, and of the marks
-#: against each other. Measured: 0.03 in photographs, 0.2 in clutter.
+#: Maximum distortion of one mark relative to its drawing, of the size of all marks, and of the
+#: marks relative to each other. Measured values are 0.03 in photographs and 0.2 in clutter.
 MISSHAPEN, WRONG_SIZE, ALIKE = 0.2, 0.12, 0.08
-#: Maximum common stretch or skew of all marks. Measured: 0.01.
+#: Maximum common stretch or skew of all marks; the measured value is 0.01.
 ASKEW = 0.04
-#: Limits for each mark where there are no more marks than unknowns of a view.
+#: Limits for each mark if there are no more marks than unknowns of a view.
 ALIKE_EACH, EXPLAINED_EACH = 0.12, 0.75
-#: Maximum residual of a view: share of the face's extent, plus pixels.
+#: Maximum residual of a view: a fraction of the face's extent, plus pixels.
 MISFIT, MISFIT_PIXELS = 0.005, 1.0
-#: Maximum standard deviation of a target's centre, as a share of its extent.
+#: Maximum standard deviation of a target's centre, as a fraction of the target's extent.
 VAGUE = 0.005
-#: Maximum distance of a target's centre from the middle of the marks seen, in their standard
-#: deviations; beyond, lens and perspective are guesses.
+#: Maximum distance of a target's centre from the middle of the observed marks, in their standard
+#: deviations. Beyond this, lens and perspective are guesses.
 FAR = 4.0
-#: Minimum share of the paint between marks that is lighter than the nearest mark.
+#: Minimum fraction of the paint between marks that is lighter than the nearest mark.
 LIGHTER = 0.8
-#: Minimum ratio of the scales of a face, and greatest ratio of the scales of its near and far side.
+#: Minimum ratio of the two scales of a face, and maximum ratio of the scales on its near and far
+#: sides.
 FLATTEST, NEAREST = 0.2, 3.0
-#: Minimum number of points of a view, with and without prior knowledge of their positions; minimum
-#: fraction of the points in the frame, likewise.
+#: Minimum number of points of a view, and minimum fraction of the points in the frame, each with
+#: and without prior knowledge of the positions.
 FEWEST, ALONE, SHARE, SHARE_ALONE = 3, 4, 0.5, 0.7
 
 
 def face_marks(face: Face) -> tuple[list[Mark], FloatArray]:
-    """Return each mark of a face once, and their places in its plane (M, 2), m."""
+    """Return each mark of a face once, and the marks' positions in its plane, m, (M, 2)."""
     kept: list[Mark] = []
     for target in face.targets:
         for mark in target.marks:
@@ -84,8 +85,8 @@ class FrameSearch:
         """The frame in 8 bits."""
         if self.grey.dtype == np.uint8:
             return self.grey
-        # Sensors leave bits unused and a beam outshines everything else, so let the brightest
-        # thousandth clip.
+        # Sensors leave bits unused, and a beam outshines everything else, so the brightest
+        # thousandth is clipped.
         top = max(float(np.percentile(self.grey[::4, ::4], 99.9)), 1.0)
         scaled = self.grey.astype(np.float32) * np.float32(255.0 / top)
         return np.asarray(np.minimum(scaled, 255.0), dtype=np.uint8)
@@ -100,7 +101,7 @@ class FrameSearch:
         return self._outlines[key]
 
     def tags(self, marks: list[Mark]) -> dict[int, FloatArray]:
-        """Return the corners (4, 2) of tags that appear exactly once, by the mark's index."""
+        """Return the corners (4, 2) of tags that appear exactly once, keyed by mark index."""
         corners = {}
         for k, mark in enumerate(marks):
             if mark.kind != "tag":
@@ -127,7 +128,7 @@ class Attempt:
     used
         Marks that are mutually consistent.
     reasons
-        Why other marks are not used.
+        Why the other marks are not used.
     text
         Why there is no view.
     looks
@@ -172,14 +173,14 @@ class Search:
     ) -> Attempt:
         """Search for every mark near ``pixels`` (M, 2) with ``scales`` (M, 2, 2).
 
-        The first, rough search gives a view with its perspective and lens. The second uses
-        the scales of that view, on which the places of corners depend.
+        The first, rough search yields a view with its perspective and lens. The second search uses
+        the scales of that view, on which the positions of corners depend.
         """
         rough = self._locate(pixels, scales, search)
         view, used = self._fit(rough, pixels if known else None)
         if view is None:
             return self._failed(rough, used, known)
-        # Refining may find a mark or two that the rough search missed, but not more.
+        # The second search may find a mark or two that the rough search missed, but not more.
         if self._points_of(used) + 2 < self._needed(view, known) or self._impossible(view):
             return self._failed(rough, used, known)
         fine = self._refine(view, used)
@@ -240,7 +241,7 @@ class Search:
             observed.places[k] = refined.pixel, refined.covariance
             observed.looks[k] = refined
             if mark.kind == "tag":
-                # The view holds perspective and lens; the rest is affine.
+                # The view accounts for perspective and lens; what remains is affine.
                 box = _square(mark) @ (np.eye(2) + refined.shape).T
                 observed.corners[k] = (
                     view.to_pixels(self.plane[k] + box) + refined.pixel - pixels[k]
@@ -251,12 +252,12 @@ class Search:
         return self.look.pictures.get(mark.code) if mark.kind == "picture" else None
 
     def tag_map(self) -> FloatArray:
-        """Return the map from plane to pixels (3, 3) of all tags; affine for a single tag."""
+        """Return the map from plane to pixels, (3, 3), from all tags; affine for a single tag."""
         places = np.concatenate([self.plane[k] + _square(self.marks[k]) for k in self.tags])
         pixels = np.concatenate(list(self.tags.values()))
         if len(self.tags) > 1:
             return homography(places, pixels)
-        # One tag is too small to tell perspective over the face.
+        # A single tag is too small to determine the perspective over the face.
         rows = np.column_stack([places, np.ones(len(places))])
         return np.vstack([np.linalg.lstsq(rows, pixels, rcond=None)[0].T, [0.0, 0.0, 1.0]])
 
@@ -293,7 +294,7 @@ class Search:
     def _points(
         self, used: list[int], observed: _Observed, known: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Return points, pixels and covariance of a tag or of three marks, four points each."""
+        """Return the points, pixels and covariance of four points, from a tag or three marks."""
         plane, pixels, covariance = [], [], []
         per_metre = self._per_metre(used, observed)
         for k in used:
@@ -302,7 +303,7 @@ class Search:
             if mark.kind == "tag":
                 plane += list(self.plane[k] + _square(mark))
                 pixels += list(observed.corners[k])
-                # The corners of a tag share its survey and position errors.
+                # The corners of a tag share the tag's survey and position errors.
                 own = (per_metre * PRINT) ** 2 + 2.0 * np.trace(spread)
                 covariance.append(np.kron(np.ones((4, 4)), common) + own * np.eye(8))
             else:
@@ -326,11 +327,11 @@ class Search:
     def _fourth(
         self, used: list[int], points: FloatArray, places: FloatArray, known: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, float] | None:
-        """Return a fourth point besides three marks, its pixel and standard deviation, px.
+        """Return a fourth point in addition to three marks, its pixel, and its sigma, px.
 
-        Three marks give an affine map. If the rough places of the marks are known, the map
-        corrects them. Otherwise perspective is unknown, up to that of the lens (or of a lens
-        of fifty degrees) at this slant.
+        Three marks determine an affine map. If the rough positions of the marks are known, the map
+        corrects them. Otherwise the perspective is unknown, up to that of the lens (or of a lens
+        with a field of view of fifty degrees) at this slant.
         """
         if np.linalg.matrix_rank(points - points[0], tol=0.1) < 2:
             return None
@@ -377,7 +378,7 @@ class Search:
         return f"only {len(used)} of its {total} marks were seen: {names}; {needed} are needed"
 
     def _problem(self, view: FaceView, used: list[int], observed: _Observed, known: bool) -> str:
-        """Return the reason why a view is not reliable; empty if it is."""
+        """Return the reason why a view is not reliable; an empty string if it is."""
         needed = self._needed(view, known)
         if self._points_of(used) < needed:
             return self._too_few(used, needed)
@@ -404,7 +405,7 @@ class Search:
         return self.within(view.to_pixels(self.plane))
 
     def within(self, pixels: FloatArray) -> list[int]:
-        """Return the indices of places (N, 2) in the frame."""
+        """Return the indices of those positions (N, 2) that are in the frame."""
         inside = (pixels >= 0.0) & (pixels <= np.array(self.look.size) - 1.0)
         return [int(k) for k in np.flatnonzero(inside.all(axis=-1))]
 
@@ -419,7 +420,7 @@ class Search:
         return bool(np.abs(depth).max() > NEAREST * np.abs(depth).min())
 
     def _misshapen(self, used: list[int], observed: _Observed, known: bool) -> str:
-        """Return what is wrong with the sizes and shapes of the marks; empty if nothing is."""
+        """Return what is wrong with the sizes and shapes of the marks; "" if nothing is wrong."""
         drawn = [k for k in used if k in observed.looks and self.marks[k].kind != "picture"]
         if not drawn:
             return ""
@@ -452,7 +453,7 @@ class Search:
         return ""
 
     def _dark(self, view: FaceView, used: list[int], observed: _Observed) -> str:
-        """Return why the area between marks is too dark to be paint; empty if it is not."""
+        """Return why the area between marks is too dark to be paint; "" if it is not too dark."""
         flat = ("corner", "tee", "square", "disc")
         shown = [k for k in used if k in observed.looks and self.marks[k].kind in flat]
         if not shown:
@@ -483,7 +484,8 @@ class Search:
         inner = []
         for k in shown:
             mark = self.marks[k]
-            # The middle of an arm of an L and of a T's bar; of a disc and a square the centre.
+            # Sample the middle of an arm of an L and of the bar of a T, and the centre of a disc or
+            # a square.
             across = {"corner": 0.5 * mark.size, "tee": 0.25 * mark.size}.get(mark.kind, 0.0)
             cos, sin = np.cos(mark.turn), np.sin(mark.turn)
             turn = np.array([[cos, -sin], [sin, cos]])
@@ -494,7 +496,7 @@ class Search:
         return dark, dark / np.clip(contrast, 0.05, 1.0)
 
     def _at(self, pixels: FloatArray) -> FloatArray:
-        """Return the frame's values at pixels (N, 2); NaN outside."""
+        """Return the frame's values at pixels (N, 2); NaN outside the frame."""
         height, width = self.look.grey.shape
         column, row = np.round(np.nan_to_num(pixels, nan=-1.0)).astype(int).T
         inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
@@ -502,7 +504,7 @@ class Search:
         return np.where(inside, values.astype(np.float64), np.nan)
 
     def _vague(self, view: FaceView, used: list[int]) -> dict[str, str]:
-        """Return the targets that the visible marks do not determine, with their reasons."""
+        """Return the targets that the visible marks do not determine, with the reasons."""
         parts = [
             self.plane[k] + (_square(self.marks[k]) if self.marks[k].kind == "tag" else 0.0)
             for k in used
@@ -536,9 +538,9 @@ class Search:
 
 
 def _problem(refined: Refined | None, mark: Mark, read: bool) -> str:
-    """Return the reason why a match is not the mark; empty if it is the mark.
+    """Return the reason why a match is not the mark; an empty string if it is the mark.
 
-    A tag whose code was ``read`` may fit less well, because its cells may be small.
+    A tag whose code was ``read`` is allowed to fit less well, because its cells may be small.
     """
     if refined is None:
         return "outside the frame or too small"
@@ -554,14 +556,14 @@ def _problem(refined: Refined | None, mark: Mark, read: bool) -> str:
 
 
 def _square(mark: Mark) -> FloatArray:
-    """Corners of a tag from the upper left, metres from its centre, (4, 2)."""
+    """Return the corners of a tag from the upper left, metres from its centre, (4, 2)."""
     cos, sin = np.cos(mark.turn), np.sin(mark.turn)
     box = 0.5 * mark.size * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
     return np.asarray(box @ np.array([[cos, sin], [-sin, cos]]))
 
 
 def _crossing(corners: FloatArray) -> FloatArray:
-    """Return where the diagonals of four corners cross: a square's centre, also in perspective."""
+    """Return where the diagonals of four corners cross, the centre of a square in perspective."""
     a, b = corners[2] - corners[0], corners[3] - corners[1]
     across = a[0] * b[1] - a[1] * b[0]
     if abs(across) < 1e-9:

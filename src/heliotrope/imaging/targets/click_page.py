@@ -1,7 +1,7 @@
 """A page, served only to this computer, on which a user clicks points in a picture.
 
-OpenCV is used without windows, so a browser shows the picture: one address on 127.0.0.1 that ends
-in a random word, one self-contained page, one reply.
+OpenCV is used without windows, so a browser shows the picture. There is one address on 127.0.0.1
+that ends in a random word, with one self-contained page that accepts one reply.
 """
 
 import json
@@ -42,7 +42,7 @@ class _State:
 
 
 class _Server(ThreadingTCPServer):
-    # Not http.server.HTTPServer, which asks the network for this machine's name.
+    # http.server.HTTPServer is avoided, because it asks the network for this computer's name.
     daemon_threads = True
 
     def __init__(self, state: _State) -> None:
@@ -63,11 +63,12 @@ class _Handler(BaseHTTPRequestHandler):
         return cast("_Server", self.server).port
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the base's name
-        """Log nothing: the terminal belongs to the command."""
+        """Log nothing, because the terminal is used by the command."""
 
     def _allowed(self) -> str | None:
         """Return the path after the random word; None if the request is not for this page."""
-        # A foreign page may resolve its own name to this machine, but then sends that name.
+        # A foreign page may let its own name resolve to this computer, but its requests then state
+        # that name.
         local = self.headers.get("Host") in (f"127.0.0.1:{self._port}", f"localhost:{self._port}")
         _, word, *rest = (self.path.split("/") + ["", ""])[:4]
         known = secrets.compare_digest(word.encode(), self._state.token.encode())
@@ -146,7 +147,7 @@ class _Handler(BaseHTTPRequestHandler):
         ):
             raise InputError(f"point {name}: enter two numbers, pixels right and down")
         x, y = (float(v) for v in value)
-        # NaN fails too.
+        # This comparison also rejects NaN.
         if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
             raise InputError(f"point {name}: {x}, {y} is not in the picture of {width} × {height}")
         return x, y
@@ -168,8 +169,8 @@ def ask(
     picture
         Grey (H, W) or blue-green-red (H, W, 3), uint8.
     places
-        Points to ask for, in this order, with their places on the target from the left and
-        from above, 0 to 1.
+        Points to ask for, in this order, with their positions on the target from the left and from
+        the top, 0 to 1.
     known
         Points already known; the page shows them.
     title
@@ -179,7 +180,7 @@ def ask(
     fewest
         Minimum number of points in a reply, including those already known.
     aspect
-        Width of the target over its height, for the page's sketch of it.
+        Width of the target divided by its height, for the sketch of the target on the page.
 
     Raises
     ------
@@ -200,7 +201,7 @@ def ask(
         thread.start()
         try:
             announce(f"http://127.0.0.1:{server.port}/{token}/")
-            # In short waits, so that Ctrl-C works.
+            # Wait in short intervals, so that Ctrl-C works.
             while not state.over.wait(0.2):
                 pass
         finally:
@@ -251,7 +252,7 @@ def _page(
         "fewest": fewest,
         "aspect": aspect,
     }
-    # Inside a script element only "<" could end it.
+    # Only "<" could end a script element.
     text = json.dumps(data, ensure_ascii=False).replace("<", "\\u003c")
     code = Path(__file__).with_name("clicking.js").read_text("utf-8").replace("export ", "")
     page = _HTML.replace("@NONCE@", nonce).replace("@CLICKING@", code)

@@ -1,4 +1,4 @@
-"""Assigns candidates to marks, by their appearance and their arrangement."""
+"""Assign candidates to marks, by their appearance and their arrangement."""
 
 from dataclasses import dataclass
 
@@ -14,17 +14,18 @@ Places = npt.NDArray[np.intp]
 
 #: Relative error of distances in a first guess, which is scaled from one candidate.
 _LOOSE = 0.25
-#: A candidate this near to a mark's place, in sizes of the mark, is the mark.
+#: A candidate is the mark if it is this close to the mark's predicted position, in sizes of the
+#: mark.
 _TIGHT = 0.5
-#: Maximum ratio of second moments to the predicted ones, for one mark.
+#: Maximum ratio of measured to predicted second moments, for one mark.
 _SPREAD = 2.6
-#: The same for all marks together, and between the axes. Measured: 1.1 at most.
+#: The same ratio for all marks together, and between the axes; measured values are 1.1 at most.
 _SIZED, _ASKEW = 1.6, 1.4
-#: A camera is upright if the face's upward direction is this near the expected one, rad.
+#: A camera is upright if the face's upward direction is this close to the expected direction, rad.
 _UPRIGHT = 0.3
-#: Minimum correlation of a candidate at a mark's place.
+#: Minimum correlation of a candidate at a mark's position.
 _RESEMBLES = 0.55
-#: Numbers of guesses weighed and followed.
+#: Number of guesses that are scored, and number that are pursued.
 _GUESSES, _FOLLOWED = 1200, 10
 
 
@@ -39,13 +40,13 @@ class Constellation:
     which
         Drawing of each mark, (M,).
     plane
-        Places of the marks' points, m, (M, 2).
+        Positions of the marks' points, m, (M, 2).
     middle
-        Places of their centres of area, m, (M, 2).
+        Positions of the marks' centres of area, m, (M, 2).
     covariance
-        Second moments, m², (M, 2, 2).
+        Second moments of the marks, m², (M, 2, 2).
     turn
-        Matrices of the marks' turns, (M, 2, 2).
+        Rotation matrices of the marks, (M, 2, 2).
     """
 
     drawn: tuple[Drawing, ...]
@@ -63,11 +64,12 @@ class Match:
     Attributes
     ----------
     marks, candidates
-        Indices of assigned pairs, (K,) each.
+        Indices of the assigned pairs, (K,) each.
     H_pixel_plane
         Homography from plane metres to pixels, (3, 3); affine if fewer than five match.
     score
-        Number of marks, then uprightness of the view, then similarity of the shapes.
+        Score, compared in this order: number of marks, uprightness of the view, similarity of the
+        shapes.
     """
 
     marks: Places
@@ -79,7 +81,7 @@ class Match:
 def constellation(
     marks: list[Mark], drawn: list[Drawing], which: Places, plane: FloatArray
 ) -> Constellation:
-    """Return marks (M,) with their drawings at places (M, 2) in the plane, m."""
+    """Return the arrangement of marks (M,), with their drawings, at positions (M, 2), m."""
     angle = np.array([mark.turn for mark in marks])
     cos, sin = np.cos(angle), np.sin(angle)
     turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=-2)
@@ -98,10 +100,11 @@ def constellation(
 def match(
     candidates: Candidates, marks: Constellation, up: FloatArray, upright: bool
 ) -> Match | None:
-    """Return the assignment that explains the most marks, or None if no three are consistent.
+    """Return the assignment that explains the most marks; None if no three are consistent.
 
-    Each candidate, assumed to be each mark that it may be, predicts the positions of all marks.
-    Candidates found at these positions yield an affine map, then a homography.
+    Each candidate is assumed in turn to be each mark that it resembles, which predicts the
+    positions of all marks. Candidates found at these positions yield an affine map, and then a
+    homography.
 
     Parameters
     ----------
@@ -112,7 +115,7 @@ def match(
     up
         Expected upward direction of the face in the frame, (2,).
     upright
-        Consider only guesses that agree with it.
+        Whether to consider only guesses that agree with ``up``.
     """
     linear, mark, part = _guesses(candidates, marks, up, upright)
     if len(linear) == 0:
@@ -144,9 +147,9 @@ def match(
 def _guesses(
     candidates: Candidates, marks: Constellation, up: FloatArray, upright: bool
 ) -> tuple[FloatArray, Places, Places]:
-    """Return linear maps plane to pixels (G, 2, 2), and the mark and candidate of each (G,)."""
+    """Return linear maps from plane to pixels (G, 2, 2), with the mark and candidate of each."""
     pair, mark = np.nonzero(candidates.drawing[:, None] == marks.which[None])
-    # A drawing is turned first, then laid in the plane: B = A · turn.
+    # A drawing is first rotated and then placed in the plane, so B = A · turn.
     linear = candidates.linear[pair] @ np.swapaxes(marks.turn[mark], 1, 2)
     if upright:
         kept = np.flatnonzero(_lean(linear, up) < _UPRIGHT)
@@ -157,7 +160,7 @@ def _guesses(
 
 
 def _lean(linear: FloatArray, up: FloatArray) -> FloatArray:
-    """Return angles (G,), rad, between the upward direction of maps (G, 2, 2) and the expected."""
+    """Return angles between maps' upward directions and the expected direction, rad, (G,)."""
     upward = linear[:, :, 1]
     along, across = upward @ up, upward[:, 0] * up[1] - upward[:, 1] * up[0]
     return np.asarray(np.abs(np.arctan2(across, along)))
@@ -170,7 +173,7 @@ def _gather(
     linear: FloatArray,
     slack: FloatArray,
 ) -> Places:
-    """Return the nearest fitting candidate of each guess and mark, or −1, (G, M)."""
+    """Return the nearest fitting candidate of each guess and mark, (G, M); −1 if none fits."""
     apart = np.linalg.norm(candidates.middle[None, None] - guess[:, :, None], axis=-1)
     alike = candidates.likeness.T[marks.which] > _RESEMBLES
     g, m, p = np.nonzero((apart < slack[..., None]) & alike[None])
@@ -182,7 +185,8 @@ def _gather(
     fits = (trace < _SPREAD) & (area > 1.0 / _SPREAD) & (area < _SPREAD)
     g, m, p = g[fits], m[fits], p[fits]
     taken = np.full(guess.shape[:2], -1)
-    # The nearest is written last. A candidate of two marks then belongs to the nearer one.
+    # The nearest candidate is written last, so that a candidate for two marks belongs to the nearer
+    # mark.
     order = np.argsort(-apart[g, m, p], kind="stable")
     taken[g[order], m[order]] = p[order]
     owner = np.full((len(guess), len(candidates.middle)), -1)
@@ -212,7 +216,7 @@ def _settle(
         size = np.sqrt(
             12.0 * np.trace(linear @ marks.covariance @ np.swapaxes(linear, 1, 2), axis1=1, axis2=2)
         )
-        # An affine map lacks perspective.
+        # An affine map does not account for perspective.
         loose = 0.04 * float(np.ptp(guess, axis=0).max()) if len(held) < 5 else 0.0
         again = _gather(
             candidates, marks, guess[None], linear[None], (_TIGHT * size + loose)[None]
@@ -231,9 +235,10 @@ def _settle(
 def _in_shape(
     candidates: Candidates, marks: Constellation, H: FloatArray, held: Places, taken: Places
 ) -> bool:
-    """Return whether sizes of marks agree with the distances between them.
+    """Return whether the sizes of the marks agree with the distances between the marks.
 
-    They disagree for a different target with other distances, because no map fits both.
+    For a different target with other distances they disagree, because no map fits both sizes and
+    distances.
     """
     back = np.linalg.inv(scales(H, marks.middle[held]))
     observed = (back @ candidates.covariance[taken] @ np.swapaxes(back, 1, 2)).sum(axis=0)
@@ -249,19 +254,19 @@ def _affine(plane: FloatArray, pixels: FloatArray) -> FloatArray:
 
 
 def mapped(H: FloatArray, plane: FloatArray) -> FloatArray:
-    """Return places (M, 2) mapped by a homography (3, 3)."""
+    """Return positions (M, 2) mapped by a homography (3, 3)."""
     places = np.column_stack([plane, np.ones(len(plane))]) @ H.T
     return np.asarray(places[:, :2] / places[:, 2:])
 
 
 def scales(H: FloatArray, plane: FloatArray) -> FloatArray:
-    """Return d(pixel)/d(plane) of a homography at places (M, 2), (M, 2, 2)."""
+    """Return d(pixel)/d(plane), (M, 2, 2), of a homography at positions (M, 2)."""
     middle = mapped(H, plane)
     return np.stack([(mapped(H, plane + 0.01 * e) - middle) / 0.01 for e in np.eye(2)], axis=-1)
 
 
 def _front(H: FloatArray, plane: FloatArray) -> bool:
-    """Return whether a face is seen from its front: right turns remain right turns."""
+    """Return whether a face is seen from its front, so that right turns remain right turns."""
     corners = np.column_stack([plane, np.ones(len(plane))]) @ H.T
     if (corners[:, 2] * corners[0, 2] <= 0.0).any():
         return False

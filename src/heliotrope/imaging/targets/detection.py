@@ -1,4 +1,4 @@
-"""Candidates for marks: dark drawings on a light background, anywhere in a frame.
+"""Find candidates for marks: dark drawings on a light background, anywhere in a frame.
 
 Seen from a distance, a flat drawing appears as an affine image of itself. Before a part of a frame
 is compared with a drawing, both are transformed so that their second moments are circular. What
@@ -21,31 +21,31 @@ from heliotrope.optics.coverage import coverage
 
 #: Minimum correlation of a candidate's shape with a drawing.
 _ALIKE = 0.72
-#: Rotations within this of the best are kept too.
+#: Rotations whose correlation is within this of the best are kept too.
 _NEARLY = 0.08
-#: Profiles: radii in standard deviations, and directions.
+#: Radii of profiles, in standard deviations, and number of directions.
 _RADII = np.linspace(0.3, 2.7, 9)
 _TURNS = 32
-#: A square seen at 75° off its normal is this many times as long as wide.
+#: A square seen at 75° off its normal is this many times as long as it is wide.
 _OBLIQUE = 4.0
-#: Strokes narrower than this are closed, reduced pixels.
+#: Strokes narrower than this are removed by the closing, reduced pixels.
 _BROAD = 17
-#: Numbers of parts of a frame examined and of candidates kept.
+#: Maximum number of parts of a frame examined, and of candidates kept.
 _PARTS, _KEPT = 300, 60
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A shape that one or more marks have, at turn 0.
+    """A shape that one or more marks have, without rotation.
 
     Attributes
     ----------
     middle
-        Its centre of area, m right of and above its point, (2,).
+        Centre of area of the drawing, m right of and above its point, (2,).
     covariance
-        Its second moments over its area, m², (2, 2).
+        Second moments of the drawing over its area, m², (2, 2).
     profile
-        Fourier transform of its brightness around the middle, (9, 17).
+        Fourier transform of the brightness around the middle, (9, 17).
     size
         Size of the mark, m.
     turning
@@ -72,9 +72,9 @@ class Candidates:
     likeness
         Correlation with each drawing, (P, D).
     part, drawing
-        Each pair of a shape and a drawing that it may be, (K,) each.
+        Index pairs of a shape and a drawing that it may show, (K,) each.
     linear
-        d(pixel)/d(drawing's metres) of the pair, (K, 2, 2).
+        d(pixel)/d(drawing's metres) of each pair, (K, 2, 2).
     """
 
     middle: FloatArray
@@ -148,7 +148,7 @@ def _roots(covariance: FloatArray) -> FloatArray:
 def _profiles(
     mask: Image, middle: FloatArray, covariance: FloatArray
 ) -> npt.NDArray[np.complex128]:
-    """Return Fourier transforms along circles of a mask around places (N, 2), (N, 9, 17)."""
+    """Return Fourier transforms of a mask along circles around positions (N, 2), (N, 9, 17)."""
     import cv2
 
     if len(middle) == 0:
@@ -175,12 +175,12 @@ def _profiles(
 
 @dataclass(frozen=True)
 class Lightened:
-    """A reduced frame, and the same without narrow dark strokes.
+    """A reduced frame, and the same frame without narrow dark strokes.
 
     Attributes
     ----------
     small, closed
-        The frame, and its closing, (h, w).
+        The reduced frame, and its closing, (h, w).
     reduction
         Factor of the frame's reduction.
     """
@@ -191,10 +191,10 @@ class Lightened:
 
 
 def lighten(grey: Image, reduction: int) -> Lightened:
-    """Return a frame (H, W) of 8 or 16 bits, reduced, and its morphological closing.
+    """Return an 8-bit or 16-bit frame (H, W), reduced, and its morphological closing.
 
-    The closing contains no marks. The frame divided by it is the reflectance of a mark over
-    that of the paint, whatever the light: in the shade as in a beam.
+    The closing contains no marks. The frame divided by the closing is the reflectance of a mark
+    relative to that of the paint, whatever the light, in the shade as well as in a beam.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def outlines(light: Lightened, ratio: float) -> DarkParts:
         # A difference of one count means nothing.
         limit = cv2.convertScaleAbs(closed, alpha=ratio, beta=-1.0)
     else:
-        # The same share for 16 bits: sensors leave bits empty.
+        # Use the same fraction of the maximum for 16 bits, because sensors leave bits empty.
         limit = ratio * closed - 0.01 * float(small.mean())
     mask = cv2.compare(small, limit, cv2.CMP_LT)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
@@ -247,7 +247,7 @@ def outlines(light: Lightened, ratio: float) -> DarkParts:
     renamed[numbers] = np.arange(len(numbers))
     middle, covariance = _moments(labels, mask, renamed, len(numbers))
     profile = _profiles(mask, middle, covariance)
-    # Pixel centres are whole numbers in both the reduced and the full frame.
+    # Pixel centres are at whole numbers in both the reduced and the full frame.
     middle = reduction * (middle + 0.5) - 0.5
     return DarkParts(middle, reduction**2 * covariance, profile)
 
@@ -273,7 +273,7 @@ def _moments(
     center = np.stack([mean(x), mean(y)], axis=-1)
     x, y = x - center[part, 0], y - center[part, 1]
     xy = mean(x * y)
-    # A pixel has an extent of its own.
+    # Add the second moment of a pixel itself.
     rows = [np.stack([mean(x * x) + 1 / 12, xy], -1), np.stack([xy, mean(y * y) + 1 / 12], -1)]
     return center, np.stack(rows, axis=-2)
 
@@ -316,7 +316,8 @@ def candidates(parts: DarkParts, drawn: Sequence[Drawing]) -> Candidates:
 def find_tags(grey: Image, numbers: Sequence[int]) -> dict[tuple[int, int], list[FloatArray]]:
     """Return the corners (4, 2), px, of all tags of some OpenCV dictionaries.
 
-    Keys are dictionary and number. Corners run clockwise from the upright tag's upper left.
+    The keys are dictionary and number. Corners run clockwise from the upper left corner of the
+    upright tag.
     """
     import cv2
 
@@ -335,23 +336,23 @@ def find_tags(grey: Image, numbers: Sequence[int]) -> dict[tuple[int, int], list
 
 
 def tag_number(mark: Mark) -> tuple[int, int]:
-    """Return the OpenCV dictionary of a tag and its number in it."""
+    """Return the OpenCV dictionary of a tag, and the tag's number in that dictionary."""
     return tag_dictionary(mark)
 
 
 def find_pictures(
     grey: Image, marks: Sequence[Mark], pictures: Mapping[str, FloatArray]
 ) -> Candidates:
-    """Search an upright frame for taught pictures at fourteen scales.
+    """Search an upright frame for reference pictures of marks at fourteen scales.
 
     Parameters
     ----------
     grey
-        A frame, (H, W), 8 bit.
+        Frame with 8 bits, (H, W).
     marks
         Marks, all of kind "picture"; entry k of the result belongs to mark k.
     pictures
-        Pictures by the codes of the marks.
+        Reference pictures, keyed by the codes of the marks.
     """
     import cv2
 
@@ -397,7 +398,7 @@ def find_pictures(
 
 
 def picture_drawings(marks: Sequence[Mark]) -> list[Drawing]:
-    """Return filled squares in place of pictures: position and size only."""
+    """Return filled squares in place of pictures, with only their position and size."""
     none = np.zeros((len(_RADII), _TURNS // 2 + 1), dtype=np.complex128)
     return [
         Drawing(np.zeros(2), mark.size**2 / 12.0 * np.eye(2), none, mark.size, True)

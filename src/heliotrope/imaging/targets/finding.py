@@ -1,4 +1,4 @@
-"""Finds targets in a raw frame by their marks, and reports where, how well, or why not.
+"""Find targets in a raw frame by their marks, and report where, how well, or why not.
 
 The search for one face makes attempts (`attempt.py`) one after the other, the quick ones first,
 until a view is good enough.
@@ -27,15 +27,16 @@ from heliotrope.imaging.targets.attempt import (
 )
 from heliotrope.imaging.targets.view import Face, FaceView, faces
 
-#: Share of the expected marks from which on no other way of looking is tried.
+#: If at least this fraction of the expected marks is found, no other search method is tried.
 _ENOUGH = 0.7
 #: Outlines are darker than these fractions of their surroundings.
 _RATIOS = (0.72, 0.85)
 #: Longer side of the reduced frame that is searched for outlines first, px.
 _LONGER = 700
-#: Of two faces in one place of the frame, one wins if this much more of it was seen.
+#: Of two faces in the same place in the frame, one is preferred if this much more of it was seen.
 _CLEARER = 0.2
-#: How a frame may be turned against its camera, as maps of pixels about the frame's middle.
+#: How a frame may be rotated or mirrored relative to its camera, as maps of pixels about the
+#: frame's middle.
 _TURNS = {
     "turned by 180°": ((-1, 0), (0, -1)),
     "mirrored left to right": ((-1, 0), (0, 1)),
@@ -45,8 +46,8 @@ _TURNS = {
     "mirrored about its falling diagonal": ((0, 1), (1, 0)),
     "mirrored about its rising diagonal": ((0, -1), (-1, 0)),
 }
-#: A turn fits if marks are this near, px, or this many deviations of the pose; and this many times
-#: nearer than without the turn.
+#: Such a map fits if marks are this close, px, or within this many standard deviations of the pose,
+#: and this many times closer than without the map.
 _TURN_PIXELS, _TURN_SIGMAS, _TURN_CLEARER = 2.0, 3.0, 3.0
 
 
@@ -59,17 +60,17 @@ class FoundMark:
     mark
         The mark.
     pixel
-        Position where the mark was seen, (2,), or where it should be if it was not seen.
+        Position where the mark was seen or, if it was not seen, where it should be, (2,).
     covariance
-        Covariance, px², (2, 2); NaN if it was not seen.
+        Covariance of the position, px², (2, 2); NaN if the mark was not seen.
     used
-        Whether it was used to fit the view.
+        Whether the mark was used to fit the view.
     reason
-        Why it was not used; empty if it was.
+        Why the mark was not used; an empty string if it was used.
     contrast
-        Brightness relative to its surroundings; NaN for a tag.
+        Brightness of the mark relative to its surroundings; NaN for a tag.
     blur
-        Blur of its vertical and horizontal edges, m, (2,); NaN for a tag.
+        Blur of the mark's vertical and horizontal edges, m, (2,); NaN for a tag.
     """
 
     mark: Mark
@@ -92,11 +93,11 @@ class FoundTarget:
     found
         Whether it was found.
     reason
-        Why it was not found; empty if it was.
+        Why the target was not found; an empty string if it was found.
     marks
         Marks of the target that were searched for.
     view
-        How its face lies in the frame; None if it was not found.
+        How the target's face lies in the frame; None if the target was not found.
     """
 
     target: Target
@@ -113,7 +114,7 @@ def find_targets(
     previous: Sequence[FaceView] = (),
     pictures: Pictures | None = None,
 ) -> list[FoundTarget]:
-    """Return where each target is in a frame, or why it was not found.
+    """Return where each target is in a frame, or why the target was not found.
 
     Parameters
     ----------
@@ -122,13 +123,13 @@ def find_targets(
     targets
         Targets with known marks. Targets in one plane are found together.
     camera
-        Its lens is used. If its pose is known too, marks are first searched for at their expected
-        positions, and a target that agrees with the pose only in a rotated or mirrored frame is
-        rejected. The lens of a camera with a different frame size is ignored.
+        Camera whose lens is used. If its pose is known too, marks are first searched for at their
+        expected positions, and a target that agrees with the pose only in a rotated or mirrored
+        frame is rejected. The lens of a camera with a different frame size is ignored.
     previous
-        Views from earlier frames of the same camera, tried first.
+        Views from earlier frames by the same camera, which are tried first.
     pictures
-        Pictures of taught marks, by their code.
+        Reference pictures of user-defined marks, keyed by the code of the mark.
 
     Notes
     -----
@@ -141,7 +142,7 @@ def find_targets(
     for face in faces(tuple(targets)):
         marks, plane = face_marks(face)
         searches.append(_Face(Search(look, face, marks, plane), _earlier(face, previous, look)))
-    # A camera that sees one face upright is not turned for another.
+    # A camera that sees one face upright cannot be rotated for another face.
     for turned in (False, True):
         for search in searches:
             search.look(turned)
@@ -172,7 +173,7 @@ class _Face:
     def __init__(self, search: Search, previous: FaceView | None) -> None:
         self.search, self.previous = search, previous
         self.best: Attempt | None = None
-        #: Number of shapes that look like one of its marks.
+        #: Number of shapes that look like one of the face's marks.
         self.shapes = 0
         self.text = ""
 
@@ -228,7 +229,7 @@ class _Face:
         return max(1, round(max(self.search.look.size) / _LONGER))
 
     def _projected(self, camera: Camera) -> tuple[FloatArray, FloatArray] | None:
-        """Return pixels and scales of the marks by the camera's pose; None if not visible."""
+        """Return the marks' pixels and scales from the camera pose; None if not visible."""
         face, plane = self.search.face, self.search.plane
         towards = np.asarray(camera.position) - face.origin
         if float(towards @ np.cross(*face.axes)) <= 0.0:
@@ -251,7 +252,7 @@ class _Face:
         return np.asarray(up / max(float(np.linalg.norm(up)), 1e-12))
 
     def _tags(self) -> Iterator[Attempt]:
-        """Yield an attempt from the tags recognised by their code."""
+        """Yield an attempt based on tags that were recognised by their code."""
         search = self.search
         if not search.tags:
             return
@@ -271,7 +272,7 @@ class _Face:
         return replace(settled, view=None, text=text) if text else settled
 
     def _elsewhere(self, attempt: Attempt, view: FaceView) -> str:
-        """Return the reason why the view may show a different target; empty if it cannot."""
+        """Return the reason why the view may show a different target; "" if it cannot."""
         search = self.search
         marks, plane, targets = search.marks, search.plane, search.face.targets
         near = 0.05 * search.extent
@@ -295,7 +296,7 @@ class _Face:
         return ""
 
     def _settled(self, attempt: Attempt, view: FaceView) -> Attempt:
-        """Return the attempt with most marks, or most upright, among similar rotations."""
+        """Return the attempt with the most marks; of similar rotations, the most upright one."""
         search, up = self.search, self._up()
         middle = search.plane.mean(axis=0)
         scale = view.scale(middle)
@@ -307,7 +308,8 @@ class _Face:
         best, least = attempt, lean(np.eye(2))
         whole = len(attempt.used) == len(search.expected(view))
         for turn, share in symmetries(search.marks, search.plane):
-            # If all marks look as they should, a rotation with dissimilar marks is excluded.
+            # If all marks look as they should, a rotation in which marks look different is
+            # excluded.
             more_upright = lean(turn) < least - 0.01
             if whole if share < 1.0 else not more_upright:
                 continue
@@ -319,7 +321,7 @@ class _Face:
         return best
 
     def _outlined(self, reduction: int, ratio: float, upright: bool) -> Iterator[Attempt]:
-        """Yield an attempt from dark shapes that look like the marks and are arranged like them."""
+        """Yield an attempt based on dark shapes that look like marks and are arranged like them."""
         search = self.search
         kept = [k for k, m in enumerate(search.marks) if m.kind not in ("tag", "picture")]
         if len(kept) < FEWEST:
@@ -329,7 +331,7 @@ class _Face:
         yield from self._matched(candidates, kept, drawn, which, upright)
 
     def _pictured(self) -> Iterator[Attempt]:
-        """Yield an attempt from taught pictures anywhere in an upright frame."""
+        """Yield an attempt based on reference pictures anywhere in an upright frame."""
         search = self.search
         kept = [k for k, m in enumerate(search.marks) if m.kind == "picture"]
         if len(kept) < FEWEST:
@@ -358,7 +360,7 @@ class _Face:
             yield self._mapped(matched.H_pixel_plane, 0.4)
 
     def compare(self, camera: Camera) -> None:
-        """Reject a view that agrees with the camera's pose only if the frame is turned back."""
+        """Reject a view that agrees with the camera pose only in a rotated or mirrored frame."""
         if self.best is None or self.best.view is None:
             return
         search = self.search
@@ -406,14 +408,14 @@ def _rank(attempt: Attempt) -> tuple[bool, int]:
 
 
 def turn_of(observed: FloatArray, expected: FloatArray, camera: Camera, look: FrameSearch) -> str:
-    """Return the turn of the frame that explains the observed marks; empty if none is needed.
+    """Return how the frame is turned, as the observed marks show; "" if it is not turned.
 
-    Marks are compared as sets, because in a turned frame marks may look like one another.
+    Marks are compared as sets, because in a turned frame a mark may look like a different mark.
 
     Parameters
     ----------
     observed, expected
-        Pixels of marks in the frame and by the camera's pose, (M, 2).
+        Pixels of marks as observed in the frame, and as expected from the camera pose, (M, 2).
     camera, look
         The camera, and the search in the frame.
     """
@@ -437,16 +439,17 @@ def turn_of(observed: FloatArray, expected: FloatArray, camera: Camera, look: Fr
 
 
 def symmetries(marks: Sequence[Mark], plane: FloatArray) -> list[tuple[FloatArray, float]]:
-    """Return quarter turns (2, 2) about their middle that map marks onto places of marks.
+    """Return quarter turns (2, 2) about the centre that map marks onto positions of marks.
 
-    Each is returned with the fraction of marks, half or more, that then also look the same.
+    Each rotation is returned with the fraction of marks that then also look the same, which is at
+    least half.
 
     Parameters
     ----------
     marks
         Marks of a face, M.
     plane
-        Their places, m, (M, 2).
+        Positions of the marks, m, (M, 2).
     """
     shares = []
     for quarter, (cos, sin) in enumerate(((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)), start=1):
@@ -474,7 +477,7 @@ def without_orientation(targets: Sequence[Target]) -> tuple[str, ...]:
 def _is_mirrored_alike(marks: Sequence[Mark], plane: FloatArray, axis: int) -> bool:
     """Return whether marks look the same with left and right (0) or top and bottom (1) swapped.
 
-    A drawing has an axis of its own: a corner's points down to the right, a tee's down.
+    A drawing has an axis of its own, which points down to the right for a corner and down for a T.
     """
     mirror = np.diag([-1.0, 1.0] if axis == 0 else [1.0, -1.0])
     about = np.pi if axis == 0 else 0.0
@@ -486,7 +489,7 @@ def _is_mirrored_alike(marks: Sequence[Mark], plane: FloatArray, axis: int) -> b
 def _share_alike(
     marks: Sequence[Mark], plane: FloatArray, moved: FloatArray, turns: Sequence[float]
 ) -> float:
-    """Return the fraction of marks that look like another mark after a map about their centre.
+    """Return the fraction of marks that look like another mark after a map about the centre.
 
     Parameters
     ----------
@@ -495,7 +498,7 @@ def _share_alike(
     moved
         The map, (2, 2).
     turns
-        Turn of each mark after it, rad.
+        Rotation of each mark after the map, rad.
     """
     middle = plane.mean(axis=0)
     extent = float(np.ptp(plane, axis=0).max())
@@ -511,7 +514,7 @@ def _share_alike(
 
 
 def _alike(a: Mark, b: Mark, turn: float) -> bool:
-    """Return whether a mark with a different rotation (rad) looks like another mark."""
+    """Return whether a mark, rotated by ``turn`` rad, looks like another mark."""
     if a.kind in ("tag", "picture") or (a.kind, a.size, a.stroke) != (b.kind, b.size, b.stroke):
         return False
     if a.kind == "disc":
@@ -522,7 +525,7 @@ def _alike(a: Mark, b: Mark, turn: float) -> bool:
 
 
 def _one_place_each(searches: Sequence[_Face]) -> None:
-    """Reject at least one of two faces that share a place in the frame."""
+    """Reject at least one of two faces that are in the same place in the frame."""
     for k, first in enumerate(searches):
         for second in searches[k + 1 :]:
             a, b = first.best, second.best
@@ -551,7 +554,7 @@ def _share(face: _Face, attempt: Attempt) -> float:
 
 
 def _covers(a: FaceView, b: FaceView) -> bool:
-    """Return whether the middle of face b is seen on face a."""
+    """Return whether the middle of face b appears on face a."""
     place = a.to_plane(b.to_pixels(b.face.span.mean(axis=0)))
     low, high = a.face.span
     return bool(((place > low) & (place < high)).all())

@@ -1,4 +1,4 @@
-"""The drawings of marks: dark polygons in the plane of their target, metres."""
+"""Draw marks as dark polygons in the plane of their target, metres."""
 
 import re
 
@@ -10,7 +10,7 @@ from heliotrope.geometry import FloatArray
 
 
 def polygons(mark: Mark) -> list[FloatArray]:
-    """Return the dark polygons of a mark, metres to the right of and above its point, each (K, 2).
+    """Return the dark polygons of a mark, (K, 2) each, m right of and above the mark's point.
 
     Raises
     ------
@@ -75,12 +75,12 @@ def _tag(mark: Mark) -> list[FloatArray]:
 
 
 def tag_dictionary(mark: Mark) -> tuple[int, int]:
-    """Return OpenCV's number of a tag's dictionary, and the tag's number in it.
+    """Return OpenCV's number of a tag's dictionary, and the tag's number in that dictionary.
 
     Raises
     ------
     InputError
-        If the code names no tag.
+        If the code does not name a tag.
     """
     import cv2
 
@@ -95,7 +95,7 @@ def tag_dictionary(mark: Mark) -> tuple[int, int]:
 
 
 def tag_cells(mark: Mark) -> FloatArray:
-    """Return the mask of dark cells of a tag, border included, (N, N)."""
+    """Return a mask of the dark cells of a tag, including its border, (N, N)."""
     import cv2
 
     number, identity = tag_dictionary(mark)

@@ -1,4 +1,4 @@
-"""A face seen from the front: the brightness of the frame on a metric grid."""
+"""Show a face from the front: the brightness of the frame on a metric grid."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ from heliotrope.imaging.targets.view import Face, FaceView, faces
 
 Mask = npt.NDArray[np.bool_]
 
-#: Pixels across the narrower side of a target. A beam is tens of them wide, and a centroid is
-#: found to a twentieth of one.
+#: Number of pixels across the narrower side of a target. A beam is tens of pixels wide, and a
+#: centroid is accurate to a twentieth of a pixel.
 ACROSS = 256
-#: Rim of a target whose pixels show part of what lies beyond: least width, multiple of the
-#: softness of the marks' edges, and greatest width, px.
+#: Rim of a target, where pixels partly show what lies beyond it: minimum width, multiple of the
+#: softness of the mark edges, and maximum width, px.
 LEAST_RIM, _SOFT_RIM, _MOST_RIM = 2, 1.5, 8
 #: Width of the rim masked around marks, m.
 _RIM = 0.06
@@ -42,11 +42,11 @@ class Rectified:
     first
         Plane coordinates of the first pixel's centre, m, (2,).
     surface
-        Where the surface of a target is visible, (H, W).
+        Mask of where the surface of a target is visible, (H, W).
     marks
-        Where marks are painted, (H, W).
+        Mask of where marks are painted, (H, W).
     clipped
-        How much each pixel is clipped, 0 to 1, (H, W); see `Frame.clipped`.
+        Degree to which each pixel is clipped, 0 to 1, (H, W); see `Frame.clipped`.
     view
         How the face lies in the frame; None for a crop.
     """
@@ -67,7 +67,7 @@ class Rectified:
 
     @cached_property
     def paint(self) -> Mask:
-        """Where bare paint is visible: on a target but not on a mark."""
+        """Mask of where bare paint is visible, that is, on a target but not on a mark."""
         return np.asarray(self.surface & ~self.marks)
 
     @cached_property
@@ -101,7 +101,7 @@ class Rectified:
 
 
 def rim_of(results: Sequence[FoundTarget]) -> int:
-    """Return the width of the rim that shows what lies beyond the targets of a face, pixels."""
+    """Return the width of the rim that partly shows what lies beyond the targets, pixels."""
     soft = [m.blur.max() for f in results for m in f.marks if m.used and np.isfinite(m.blur).all()]
     if not soft:
         return LEAST_RIM
@@ -165,7 +165,7 @@ def from_crop(frame: Frame, target: Target, *, rim: int = 0) -> Rectified:
     frame
         The crop, of any size.
     target
-        The target that it shows.
+        The target that the crop shows.
     rim
         Width of the rim that is excluded from the surface, pixels of the grid.
     """
@@ -210,9 +210,10 @@ def _trimmed(surface: Mask, rim: int) -> Mask:
 
 
 def _places(view: FaceView, first: FloatArray, step: float, shape: tuple[int, int]) -> Image:
-    """Return the frame's pixels (H, W, 2) of a grid.
+    """Return the frame pixels (H, W, 2) that correspond to a grid.
 
-    Computed at every eighth pixel and interpolated, which errs by some thousandths of a pixel.
+    They are computed at every eighth pixel and interpolated, with an error of some thousandths of a
+    pixel.
     """
     import cv2
 
@@ -230,7 +231,7 @@ def _places(view: FaceView, first: FloatArray, step: float, shape: tuple[int, in
 
 
 def _around(grey: Image, places: Image, reduction: int) -> tuple[Image, Image]:
-    """Return the part of a frame that holds some places, and its corner (column, row)."""
+    """Return the part of a frame that contains some pixels, and its corner (column, row)."""
     margin = 2 * reduction
     sides = []
     for k, length in ((0, grey.shape[1]), (1, grey.shape[0])):
@@ -249,7 +250,7 @@ def _resample(grey: Image, reduction: int, at: Image, full: float) -> Image:
     small = grey
     if reduction > 1:
         height, width = grey.shape
-        # Whole blocks only, so that their centres are exact.
+        # Use whole blocks, so that their centres are exact.
         whole = grey[: height // reduction * reduction, : width // reduction * reduction]
         size = (width // reduction, height // reduction)
         small = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)

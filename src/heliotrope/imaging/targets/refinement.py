@@ -1,7 +1,7 @@
-"""Locates a mark to a fraction of a pixel by fitting its drawing to the frame.
+"""Locate a mark to a fraction of a pixel by fitting its drawing to the frame.
 
 The pixel values at a mark follow a + b·x + c·y + (d + e·x + f·y)·drawing, which accounts for light
-that varies evenly over paint and print, and for stray light. Second derivatives of the drawing
+that varies linearly over paint and print, and for stray light. Second derivatives of the drawing
 account for blur that differs from that of the drawing, so blur does not shift the mark.
 """
 
@@ -19,17 +19,17 @@ from heliotrope.optics.coverage import coverage
 
 Values = npt.NDArray[np.float32]
 
-#: Samples across a mark: pixels per sample, greatest number, greatest number while searching,
-#: and least number.
+#: Samples across a mark: pixels per sample, maximum number, maximum number while searching, and
+#: minimum number.
 _PIXELS, _MOST, _COARSE, _FEWEST = 1.5, 32, 20, 6
-#: Samples that count as one, because lens and interpolation correlate neighbours.
+#: This many samples count as one, because lens and interpolation correlate neighbours.
 _SHARED = 4.0
-#: A mark brighter than this share of the paint around it is pale; blurs of the drawing that are
-#: then tried, in strokes.
+#: A mark is pale if it is brighter than this fraction of the paint around it; blurs of the drawing
+#: that are then tried, in stroke widths.
 _PALE, _SOFTNESS = 0.6, (0.0, 0.4, 0.6, 0.8, 1.0, 1.3, 1.7)
-#: Error that no fit shows: print, relief and blur of a mark, px.
+#: Error due to print, relief and blur of a mark, which no fit reveals, px.
 _FLOOR = 0.1
-#: Blur of a drawing, samples: about that of pixels and a lens.
+#: Blur of a drawing, samples, which is about that of pixels and a lens.
 _SOFT = 0.8
 #: Blur of the samples, so that they can be interpolated.
 _SMOOTH = 0.7
@@ -38,7 +38,8 @@ _SMOOTH = 0.7
 _STEPS, _STILL = 6, 0.01
 #: Margin around a drawing, in its own size.
 _MARGIN = 0.3
-#: If even light explains less than this, the fit is repeated with the light divided out.
+#: If a model with even light explains less than this fraction, the fit is repeated with the light
+#: divided out.
 _CLEAR = 0.8
 
 
@@ -49,19 +50,19 @@ class Refined:
     Attributes
     ----------
     pixel
-        Pixel of its point, (2,).
+        Pixel of the mark's point, (2,).
     covariance
-        px², (2, 2), of the image alone, without the survey.
+        Covariance of the pixel from the image alone, without the survey, px², (2, 2).
     contrast
-        Brightness of the drawing over that of its surroundings; 1 if nothing is there.
+        Brightness of the drawing divided by that of its surroundings; 1 if there is no mark.
     explained
-        Share of the variance that the drawing explains, at most 1.
+        Fraction of the variance that the drawing explains, at most 1.
     blur
         Standard deviation of the blur across upright and level edges, m, (2,); not
         measurable below two pixels.
     shape
-        Distortion against the drawing: a place d of the drawing is seen where ``d + shape @ d``
-        should be, (2, 2).
+        Distortion relative to the drawing, (2, 2): the position d of the drawing is seen where ``d
+        + shape @ d`` should be.
     """
 
     pixel: FloatArray
@@ -79,7 +80,7 @@ class _Template:
     Attributes
     ----------
     values
-        Share of each cell that is drawn, softened, (H, W).
+        Fraction of each cell that is drawn, softened, (H, W).
     first
         Centre of the first cell relative to the mark's point, m, (2,).
     step
@@ -90,7 +91,7 @@ class _Template:
     sign
         −1 for a drawing, which is darker than its surroundings; 1 for a picture.
     stroke
-        Width of its strokes, cells.
+        Width of the drawing's strokes, cells.
     """
 
     values: FloatArray
@@ -119,22 +120,22 @@ def refine(
     mark
         The mark.
     pixel
-        Approximate position of its point, (2,).
+        Approximate pixel of the mark's point, (2,).
     scale
         d(pixel)/d(plane) there, px/m, (2, 2). Its errors, over half the size of the mark,
         are errors of the point.
     search
-        Search radius, in sizes of the mark; 0: within a stroke.
+        Search radius, in sizes of the mark; with 0 the search is limited to a stroke width.
     picture
-        Picture of a taught mark, upright in the plane, (N, N).
+        Reference picture of the mark, upright in the plane, (N, N).
     within
         Bounds of the target's paint relative to the mark's point, m, (2, 2); pixels outside
         are ignored.
 
     Returns
     -------
-    None if it lies outside the frame, is smaller than nine pixels, or nothing like it is
-    there.
+    The refined position; None if the mark lies outside the frame, is smaller than nine pixels, or
+    nothing similar is there.
     """
     start = pixel
     if search > 0.0:
@@ -163,9 +164,9 @@ def locate(
     search: float,
     picture: FloatArray | None = None,
 ) -> tuple[FloatArray, float, float] | None:
-    """Return a mark's approximate position, (2,), its standard deviation, px, and correlation.
+    """Return a mark's approximate position, px, (2,), its sigma, px, and its correlation.
 
-    Parameters are those of `refine`.
+    The parameters are those of `refine`; the result is None if the mark is not found.
     """
     import cv2
 
@@ -274,13 +275,14 @@ def _sample(
     step: float,
     shape: tuple[int, int],
 ) -> tuple[Values, npt.NDArray[np.bool_] | None] | None:
-    """Return a frame on a grid of the plane, and which cells are in the frame (None: all).
+    """Return a frame sampled on a grid of the plane, and a mask of the cells in the frame.
 
-    None if most of the grid is outside. Pixels finer than the grid are averaged first.
+    The mask is None if all cells are in the frame, and the result is None if most of the grid is
+    outside. Pixels finer than the grid are averaged first.
     """
     import cv2
 
-    # One affine map from column and row to the plane and to pixels.
+    # A single affine map leads from column and row to the plane and to pixels.
     A = scale @ np.array([[step, 0.0], [0.0, -step]])
     b = pixel + scale @ first
     rows, columns = shape
@@ -320,7 +322,7 @@ def _sample(
 
 
 def _paint(template: _Template, within: FloatArray | None) -> Values:
-    """Return 1 for cells of a template within bounds and 0 for others, (H · W,)."""
+    """Return 1 for cells of a template within bounds, and 0 for the other cells, (H · W,)."""
     rows, columns = template.values.shape
     if within is None:
         return np.ones(rows * columns, dtype=np.float32)
@@ -333,7 +335,7 @@ def _paint(template: _Template, within: FloatArray | None) -> Values:
 
 
 def _relit(samples: Image, stroke: float) -> Image:
-    """Return samples divided by the light on them: their closing, which removes strokes."""
+    """Return samples divided by the light on them, which is estimated by a closing."""
     import cv2
 
     broad = 2 * int(0.65 * stroke + 1.5) + 1
@@ -369,7 +371,7 @@ def _adjust(
         off = np.abs(residual)
         spread = max(1.4826 * _quantile(off, 0.5), 0.1)
         weight = (1.0 / np.maximum(off / (2.0 * spread), 1.0)).astype(np.float32)
-        # A drawing moved by δ is the drawing minus δ times its slope.
+        # To first order, a drawing moved by δ is the drawing minus δ times its slope.
         depth = numbers[3] if abs(numbers[3]) > 1e-9 else 1e-9
         move = np.clip(-numbers[4:6] / depth, -2.0 * step, 2.0 * step)
         shift = shift + move
@@ -389,13 +391,13 @@ def _quantile(values: Values, share: float) -> float:
 
 
 def _solve(basis: Values, weight: Values, samples: Values) -> tuple[FloatArray, FloatArray]:
-    """Return normal matrix and solution of weighted least squares."""
+    """Return the normal matrix and the solution of weighted least squares."""
     weighted = basis * weight[:, None]
     information = (weighted.T @ basis).astype(np.float64)
     aim = (weighted.T @ samples).astype(np.float64)
     size = np.sqrt(np.maximum(np.diag(information), 1e-12))
-    # The columns of a disc's turn or of a broad blur vanish; a ridge keeps their numbers at 0.
-    # It also exceeds the rounding of sums in single precision.
+    # The columns for the rotation of a disc or for a broad blur vanish, and a ridge keeps their
+    # coefficients at 0. The ridge also exceeds the rounding errors of sums in single precision.
     ridge = information / np.outer(size, size) + 1e-6 * np.eye(len(size))
     return information, np.linalg.solve(ridge, aim / size) / size
 
@@ -410,7 +412,7 @@ def _judged(
     place: FloatArray,
     scale: FloatArray,
 ) -> Refined:
-    """Return covariance, contrast and the other measures of a mark that was found."""
+    """Return the covariance, contrast and other measures of a mark that was found."""
     step, depth = template.step, float(numbers[3])
     weight = weight * inside
     information, full = _solve(template.basis, weight, samples)
@@ -428,7 +430,8 @@ def _judged(
     down, right = np.gradient(samples.reshape(template.values.shape))
     steepest = np.array([_quantile(np.abs(slope), 0.985) for slope in (right, down)])
     blur = step * abs(depth) / (np.sqrt(2.0 * np.pi) * np.maximum(steepest, 1e-9))
-    # A drawing stretched by 1 + s is the drawing minus s times the place times its slope.
+    # To first order, a drawing stretched by 1 + s is the drawing minus s times the position times
+    # its slope.
     shape = -full[10:].reshape(2, 2) / (full[3] if abs(full[3]) > 1e-9 else 1e-9)
     return Refined(
         pixel=place,
@@ -443,7 +446,7 @@ def _judged(
 def _softer(
     template: _Template, samples: Values, weight: Values, contrast: float, blur: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Return contrast and blur of a pale mark, which is under stray light or out of focus.
+    """Return the contrast and blur of a mark that is pale due to stray light or defocus.
 
     The blur terms of the model are valid while the blur is small compared with the stroke. For
     larger blur, drawings with several blurs along each axis are compared, and the best fit is used.

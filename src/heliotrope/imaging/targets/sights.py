@@ -1,4 +1,4 @@
-"""What cameras see of targets: distance, resolution, obliquity, and the fraction in the frame."""
+"""How cameras see targets: distance, resolution, obliquity, and fraction in the frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ class TargetView:
     Attributes
     ----------
     target
-        Its name.
+        Name of the target.
     distance
-        Distance from the camera to its centre, m.
+        Distance from the camera to the target's centre, m.
     metres_per_pixel
         Resolution at the centre, as the square root of the area of a pixel, m.
     obliquity
@@ -28,7 +28,7 @@ class TargetView:
     share
         Fraction of the target in the frame.
     marks
-        Number of its marks in the frame.
+        Number of the target's marks in the frame.
     """
 
     target: str
@@ -70,7 +70,7 @@ def sights(camera: Camera, targets: Sequence[Target]) -> list[TargetView]:
 
 
 def _held(camera: Camera, pixels: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return whether pixels (..., 2) are in the frame; NaN, behind the camera, is not."""
+    """Return whether pixels (..., 2) are in the frame; NaN (behind the camera) is not."""
     with np.errstate(invalid="ignore"):
         held = (pixels > -0.5) & (pixels < np.array(camera.size) - 0.5)
     return np.asarray(held.all(axis=-1))

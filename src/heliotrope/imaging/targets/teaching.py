@@ -1,8 +1,8 @@
-"""Teaching: a user marks the known points of a target in one picture.
+"""Define the marks of a target from known points that a user identifies in one picture.
 
 If there is a mark of a known kind at a point, the point is refined to a fraction of a pixel.
-Otherwise the part of the picture around the point becomes a mark. The points also locate the
-camera.
+Otherwise the part of the picture around the point is stored as a reference picture and becomes a
+mark. The points also determine the position of the camera.
 """
 
 import hashlib
@@ -25,15 +25,16 @@ from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.pose import CameraFit, calibrate_marks, resection
 
 CORNERS = ("upper_left", "upper_right", "lower_right", "lower_left")
-#: Kinds of marks that can be taught.
+#: Kinds of marks that can be defined in this way.
 KINDS = ("corner", "tee", "square", "disc", "picture")
-#: Default side of a taught picture over the target's shorter side.
+#: Default side of a reference picture, as a fraction of the target's shorter side.
 SHARE = 0.12
-#: Sides of a taught picture, px.
+#: Minimum and maximum side of a reference picture, px.
 SMALLEST, LARGEST = 12, 512
-#: Maximum error of a point given by hand, px.
+#: Maximum error of a manually specified point, px.
 REACH = 12.0
-#: Minimum share of the variance that a drawing explains; greatest brightness over its surroundings.
+#: Minimum fraction of the variance that a drawing explains; maximum brightness relative to its
+#: surroundings.
 EXPLAINED, CONTRAST = 0.5, 0.93
 #: A picture that can be located no better than this, px, shows only an edge or nothing.
 VAGUE = 0.5
@@ -43,14 +44,15 @@ Pixel = tuple[float, float]
 
 @dataclass(frozen=True)
 class Wish:
-    """The mark to be taught at a point.
+    """The mark to be defined at a point.
 
     Attributes
     ----------
     kind
-        One of `KINDS`; None: the target's present mark, or a picture.
+        One of `KINDS`; None for the target's present mark or, if there is none, a picture.
     size, stroke
-        See `Mark`, m; None: `SHARE` of the target for a picture, a fifth of the size for strokes.
+        See `Mark`, m. None for the default: `SHARE` of the target for a picture, and a fifth of the
+        size for strokes.
     """
 
     kind: str | None = None
@@ -76,13 +78,13 @@ class TaughtPoint:
     name
         Name of the point.
     pixel, covariance
-        Position, (2,), with covariance, px² (2, 2).
+        Position, px, (2,), and its covariance, px², (2, 2).
     mark
         The new mark of the target at this point; None if nothing there could be recognised again.
     refined
         Whether the position was refined by the drawing of the mark; otherwise it is as specified.
     note
-        Why the mark differs from the request; empty if it does not.
+        Why the mark differs from the request; an empty string if it does not.
     """
 
     name: str
@@ -95,7 +97,7 @@ class TaughtPoint:
 
 @dataclass(frozen=True)
 class Taught:
-    """The result of teaching.
+    """The result of `teach`.
 
     Attributes
     ----------
@@ -106,9 +108,9 @@ class Taught:
     fit
         Fit of the camera.
     points
-        Points in the order given.
+        Points in the order in which they were specified.
     pictures
-        Taught pictures (N, N), uint8, by file name, which is also their code.
+        Reference pictures (N, N), uint8, keyed by file name, which is also their code.
     """
 
     plant: Plant
@@ -122,7 +124,7 @@ class Taught:
 def known_points(target: Target) -> dict[str, FloatArray]:
     """Return the named points of a target, ENU metres: marks, then markers, then corners.
 
-    If several points have the same name, the first counts.
+    If several points have the same name, the first is used.
     """
     points = {mark.name: mark.point for mark in target.marks}
     for name, point in target.markers.items():
@@ -135,7 +137,7 @@ def known_points(target: Target) -> dict[str, FloatArray]:
 
 
 def places_of(target: Target) -> tuple[dict[str, Pixel], float]:
-    """Return the places of `known_points` from the left and from above, 0 to 1, and the aspect."""
+    """Return the positions of `known_points` from the left and top, 0 to 1, and the aspect."""
     known = known_points(target)
     plane = target.plane_coordinates(np.array(list(known.values())))
     corners = target.plane_coordinates(target.corners)
@@ -146,7 +148,7 @@ def places_of(target: Target) -> tuple[dict[str, Pixel], float]:
 
 
 def shown_pixels(frame: Frame) -> npt.NDArray[np.uint8]:
-    """Return the frame brightened: in a dark frame, points are hard to click."""
+    """Return the frame brightened, because points in a dark frame are hard to click."""
     pixels = frame.pixels.astype(np.float32)
     top = max(float(np.percentile(pixels, 99.9)), 1.0)
     return np.asarray(np.clip(pixels * (255.0 / top), 0.0, 255.0), dtype=np.uint8)
@@ -172,28 +174,28 @@ def teach(
     plant
         The plant with the target.
     target
-        Its name.
+        Name of the target.
     frame
         The picture.
     given
-        Pixels by the names in `known_points`; four or more, each within `REACH` of its true
-        position.
+        Pixels, keyed by the names in `known_points`. There must be four or more, each within
+        `REACH` of its true position.
     camera
-        Its name. If the plant has a camera of that name, its lens is taken as known; otherwise the
-        lens is solved too, see `pose.calibrate_marks`.
+        Name of the camera. If the plant has a camera of that name, its lens is taken as known;
+        otherwise the lens is estimated too (see `pose.calibrate_marks`).
     wishes, wish
-        Marks to teach, by the name of the point, and the mark for all other points.
+        Marks to define, keyed by the name of the point, and the mark for all other points.
     sigma
         Standard deviation of a coordinate of a manually specified point, px.
     anew
         Whether to solve for the lens of a camera that is already in the plant.
     prefix
-        Prefix of the file names of taught pictures.
+        Prefix of the file names of reference pictures.
 
     Raises
     ------
     InputError
-        If names are unknown, or points are too few, outside the picture, or arranged unlike the
+        If names are unknown, or points are too few, outside the picture, or not arranged as on the
         target.
     """
     if not (np.isfinite(sigma) and sigma > 0.0):
@@ -218,7 +220,8 @@ def teach(
         TaughtPoint(n, x, sigma**2 * np.eye(2), None, False)
         for n, x in zip(named, pixels, strict=True)
     ]
-    # A second pass with the scale and turn of the first, since points by hand err by some per cent.
+    # A second pass uses the scale and rotation of the first, because manually specified points have
+    # errors of some per cent.
     for search in (REACH, 0.25 * REACH):
         for k, mark in enumerate(drawn):
             if mark is not None:
@@ -251,9 +254,9 @@ def write_taught(taught: Taught, path: str | Path, folder: str | Path | None = N
 
 
 def write_with_pictures(plant: Plant, path: str | Path, folder: str | Path | None = None) -> None:
-    """Copy the taught pictures of ``folder``, then write the plant file.
+    """Copy the reference pictures from ``folder``, then write the plant file.
 
-    Its table remains CSV or Parquet.
+    The plant's table remains in its format, CSV or Parquet.
     """
     from operator import methodcaller
 
@@ -277,12 +280,12 @@ def write_with_pictures(plant: Plant, path: str | Path, folder: str | Path | Non
 
 
 def read_pictures(folder: str | Path, targets: Sequence[Target]) -> dict[str, FloatArray]:
-    """Return taught pictures (N, N) by their code, from the folder of the plant file.
+    """Return reference pictures (N, N), keyed by code, from the folder of the plant file.
 
     Raises
     ------
     FormatError
-        If one is missing or not square.
+        If a picture is missing or not square.
     """
     from heliotrope.imaging.files import read_image
 
@@ -310,7 +313,7 @@ def read_pictures(folder: str | Path, targets: Sequence[Target]) -> dict[str, Fl
 def _check_points(
     target: Target, frame: Frame, pixels: Mapping[str, Pixel]
 ) -> dict[str, FloatArray]:
-    """Return the ENU points of the pixels, in their order."""
+    """Return the ENU points that belong to the pixels, in the order of the pixels."""
     known = known_points(target)
     width, height = frame.size
     for name, (x, y) in pixels.items():
@@ -336,13 +339,13 @@ def _check_points(
 def _homography(
     target: Target, plane: FloatArray, pixels: FloatArray, names: Sequence[str]
 ) -> FloatArray:
-    """Return H_pixel_plane (3, 3) if the points are arranged as on the target."""
+    """Return H_pixel_plane (3, 3); raise an error if points are not arranged as on the target."""
     import cv2
 
     what = f"target {target.name}: the points {', '.join(names)}"
     if np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)[1] < 0.02 * np.ptp(plane):
         raise InputError(f"{what} lie on one line; use points that span an area")
-    # None, where there is no solution, becomes a NaN.
+    # If there is no solution, None becomes NaN.
     H = as_float(cv2.findHomography(plane, pixels)[0])
     if not np.isfinite(H).all():
         raise InputError(f"{what} cannot be a view of this target; check for swapped names")
@@ -395,7 +398,7 @@ def _drawing(name: str, point: FloatArray, wish: Wish, old: Mark | None) -> Mark
 def _refine(
     frame: Frame, taught: TaughtPoint, mark: Mark, view: tuple[FloatArray, FloatArray], reach: float
 ) -> TaughtPoint:
-    """Refine a point by the mark's drawing, at the quarter turn that explains most."""
+    """Refine a point with the mark's drawing, rotated by the quarter turn that explains most."""
     from heliotrope.imaging.targets.refinement import Refined, refine
 
     scale = _scale(*view)
@@ -430,18 +433,18 @@ def _picture(
     prefix: str,
     pictures: dict[str, npt.NDArray[np.uint8]],
 ) -> TaughtPoint:
-    """Take the part of the picture around a point, upright in the plane, as its mark."""
+    """Use the part of the picture around a point, upright in the plane, as the point's mark."""
     import cv2
 
     (H, place), side = view, size * _per_metre(*view)
     if side < SMALLEST:
         return _nothing(taught, f"a picture of {size:.2f} m has {side:.0f} px, below {SMALLEST} px")
-    # Odd, so that one pixel's centre is the point.
+    # The number is odd, so that the centre of one pixel is the point.
     count = min(int(side), LARGEST) // 2 * 2 + 1
     offset = (np.arange(count) - count // 2) * (size / count)
     right, up = np.meshgrid(offset, -offset)
     grid = place + np.stack([right, up], axis=-1).reshape(-1, 2)
-    # The point stays where the user put it; the view defines the plane around it.
+    # The point stays where the user placed it, and the view defines the plane around it.
     spots = _mapped(H, grid) + taught.pixel - _mapped(H, place[None])[0]
     width, height = frame.size
     if (spots.min(axis=0) < -0.5).any() or (spots.max(axis=0) > [width - 0.5, height - 0.5]).any():
@@ -466,12 +469,13 @@ def _nothing(taught: TaughtPoint, why: str) -> TaughtPoint:
 
 
 def _vagueness(picture: npt.NDArray[np.uint8]) -> float:
-    """Return the standard deviation, px, with which a picture is located in its worst direction.
+    """Return how accurately a picture can be located in its worst direction, px.
 
-    From its structure tensor and its noise (Förstner and Gülch 1987).
+    The standard deviation follows from the structure tensor and the noise of the picture (Förstner
+    and Gülch 1987).
     """
     p = picture.astype(np.float64)
-    # Noise from second differences along both axes (Immerkær 1996).
+    # The noise is estimated from second differences along both axes (Immerkær 1996).
     rough = p[:-2] - 2.0 * p[1:-1] + p[2:]
     rough = rough[:, :-2] - 2.0 * rough[:, 1:-1] + rough[:, 2:]
     noise = max(1.4826 * float(np.median(np.abs(rough))) / 6.0, 1.0)
@@ -479,7 +483,7 @@ def _vagueness(picture: npt.NDArray[np.uint8]) -> float:
     down = 0.5 * (p[2:, 1:-1] - p[:-2, 1:-1])
     tensor = np.array([[np.sum(a * b) for b in (right, down)] for a in (right, down)])
     least = float(np.linalg.eigvalsh(tensor)[0])
-    # Noise alone has slopes too.
+    # Subtract the slopes that noise alone would have.
     return noise / np.sqrt(least) if least > 2.0 * right.size * noise**2 else float("inf")
 
 
@@ -487,7 +491,7 @@ def _eight_bit(frame: Frame) -> npt.NDArray[np.uint8]:
     grey = np.asarray(frame.grey)
     if grey.dtype == np.uint8:
         return np.asarray(grey, dtype=np.uint8)
-    # Sensors of 10 or 12 bit leave the upper bits empty.
+    # Sensors with 10 or 12 bits leave the upper bits empty.
     top = max(float(grey.max()), 1.0)
     return np.asarray(np.round(grey * (255.0 / top)), dtype=np.uint8)
 
@@ -559,12 +563,12 @@ class SeenMarks:
     Attributes
     ----------
     points, pixels, covariances
-        For each frame with marks: ENU metres (N, 3), pixels (N, 2), px² including the survey
-        (N, 2, 2).
+        For each frame with marks: points, ENU metres, (N, 3), pixels, (N, 2), and covariances
+        including the survey, px², (N, 2, 2).
     targets
-        Names of the targets found.
+        Names of the targets that were found.
     reasons
-        Why targets were not found, in sentences.
+        Why targets were not found, as sentences.
     """
 
     points: tuple[FloatArray, ...]
@@ -577,12 +581,12 @@ class SeenMarks:
 def see_marks(
     plant: Plant, folder: str | Path, frames: Sequence[Frame], camera: Camera | None
 ) -> SeenMarks:
-    """Find the marks of a plant's targets in frames; taught pictures lie in ``folder``.
+    """Find the marks of a plant's targets in frames; ``folder`` has the reference pictures.
 
     Raises
     ------
     InputError
-        If no target has marks, or none is found.
+        If no target has marks, or no target is found.
     """
     from heliotrope.imaging.targets.attempt import SURVEY
     from heliotrope.imaging.targets.finding import FoundMark, find_targets
@@ -629,7 +633,7 @@ def see_marks(
 def fit_marks(
     size: tuple[int, int], marks: SeenMarks, known: Camera | None, name: str, anew: bool
 ) -> CameraFit:
-    """Return the camera fitted to its marks; a known lens is kept unless ``anew`` is set."""
+    """Return a camera fitted to marks; a known lens is kept unless ``anew`` is true."""
     if known is None or anew:
         return calibrate_marks(size, marks.points, marks.pixels, marks.covariances, name)
     parts = marks.points, marks.pixels, marks.covariances

@@ -1,4 +1,4 @@
-"""A view: the mapping from a plane with targets to one frame, with its covariance."""
+"""Map a plane with targets to one frame (a view), with the covariance of the mapping."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,10 +11,10 @@ from heliotrope.field.camera import Camera, distort, project, undistort
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 
-#: Standard deviation of k1 of an unknown lens, at a focal length of the frame's longer side.
-#: Photographic lenses stay below.
+#: Standard deviation of k1 for an unknown lens whose focal length equals the frame's longer side.
+#: Photographic lenses have less distortion.
 LENS_DEVIATION = 0.1
-#: Minimum error of a located camera as a whole, and of single points by its lens, px.
+#: Minimum error of a located camera as a whole, and of single points due to its lens, px.
 _TURNED, _FITTED = 0.33, 0.1
 
 
@@ -37,7 +37,7 @@ class Face:
     axes: FloatArray
 
     def plane(self, points: npt.ArrayLike) -> FloatArray:
-        """Return metres to the right of and above the origin, (..., 2), for ENU points (..., 3)."""
+        """Return positions right of and above the origin, m, (..., 2), of ENU points (..., 3)."""
         return np.asarray((np.asarray(points, dtype=np.float64) - self.origin) @ self.axes.T)
 
     def point(self, plane: npt.ArrayLike) -> FloatArray:
@@ -46,7 +46,7 @@ class Face:
 
     @property
     def span(self) -> FloatArray:
-        """Smallest and largest plane coordinates of the targets' corners, (2, 2)."""
+        """Smallest and largest plane coordinates of the target corners, m, (2, 2)."""
         corners = self.plane(np.concatenate([t.corners for t in self.targets]))
         return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
@@ -138,7 +138,8 @@ class FaceView:
     def covariance_at(self, plane: npt.ArrayLike) -> FloatArray:
         """Return the covariance, m², (2, 2), of the position seen at a given pixel.
 
-        It contains only the errors of the view: of the marks, their survey and the lens.
+        The covariance includes only the errors of the view, that is, of the marks, their survey and
+        the lens.
         """
         place = np.asarray(plane, dtype=np.float64)
         numbers = _numbers(self.face, self.H_norm_plane, self.lens)
@@ -148,7 +149,7 @@ class FaceView:
 
 
 def unknown_lens(size: tuple[int, int]) -> Camera:
-    """Return a lens without distortion of which only the frame size is known."""
+    """Return a camera of which only the frame size is known, without distortion."""
     focal = float(max(size))
     matrix = np.array(
         [[focal, 0.0, 0.5 * (size[0] - 1)], [0.0, focal, 0.5 * (size[1] - 1)], [0.0, 0.0, 1.0]]
@@ -191,18 +192,18 @@ def fit_view(
     plane, pixels
         Points in the plane, m, and their pixels, (N, 2), N ≥ 4.
     covariance
-        Covariance of the pixels, including survey errors: per pixel, (N, 2, 2), or jointly, (2N,
-        2N).
+        Covariance of the pixels, including survey errors, either of each pixel, (N, 2, 2), or of
+        all pixels jointly, (2N, 2N).
     lens
         Initial lens; unless ``lens_known``, its k1 is estimated with the prior `LENS_DEVIATION`.
 
     Notes
     -----
-    The covariance is scaled by the residuals, as far as the number of observations exceeds that of
-    the unknowns: (ν + χ²)/(ν + dof) with ν = 4, never below 1.
+    The covariance is scaled by the residuals with the factor (ν + χ²)/(ν + dof), but at least 1.
+    Here ν = 4, and dof is the number of observations minus that of the unknowns.
     """
     white = np.linalg.inv(np.linalg.cholesky(covariance))
-    # A tiny deviation of the prior fixes a known lens without a second code path.
+    # A tiny standard deviation of the prior fixes a known lens without a second code path.
     deviation = LENS_DEVIATION * (1e-4 if lens_known else 1.0)
     prior = lens.distortion[0]
 
@@ -221,7 +222,7 @@ def fit_view(
         miss, J = residuals(numbers), _slopes(residuals, numbers)
         step = np.linalg.lstsq(J, -miss, rcond=None)[0]
         numbers = numbers + step
-        # The start is within a pixel or two, from where Gauss-Newton converges.
+        # The start is within a pixel or two, close enough for Gauss-Newton to converge.
         before, cost = cost, float(miss @ miss)
         if before - cost <= 1e-6 * cost:
             break
@@ -247,8 +248,8 @@ def fit_view(
 def posed_view(camera: Camera, target: Target) -> FaceView:
     """Return the view of a surface without marks, from the camera pose alone.
 
-    Its covariance is that of rotating the whole camera by its ``deviation``, at least a third of a
-    pixel.
+    The covariance is that of a rotation of the whole camera by the camera's ``deviation``, but at
+    least a third of a pixel.
 
     Raises
     ------
@@ -271,7 +272,7 @@ def posed_view(camera: Camera, target: Target) -> FaceView:
 
 
 def _slopes(function: Callable[[FloatArray], FloatArray], numbers: FloatArray) -> FloatArray:
-    """Return derivatives (M, 9) of a function of (..., 9), by central differences."""
+    """Return the derivatives (M, 9) of a function of nine unknowns, by central differences."""
     steps = 1e-6 * np.eye(len(numbers))
     ahead, back = function(numbers + steps), function(numbers - steps)
     return np.asarray(((ahead - back) / 2e-6).T)
@@ -295,7 +296,7 @@ def _scales(face: Face) -> FloatArray:
 
 
 def _numbers(face: Face, H: FloatArray, lens: Camera) -> FloatArray:
-    """Return the nine unknowns: H of scaled coordinates, its last element set to 1, and k1."""
+    """Return nine unknowns: H of scaled coordinates, with last element 1, and then k1."""
     scaled = (H / H[2, 2]) * _scales(face)
     return np.append(scaled.ravel()[:8], lens.distortion[0])
 
