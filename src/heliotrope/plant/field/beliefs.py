@@ -35,12 +35,12 @@ class KnownSightings:
     sightings
         The sightings, with heliostat index 0.
     identities
-        Numbers given by the store; 0 for a sighting that is not stored, (M,).
+        Numbers assigned by the store, (M,); 0 for a sighting that is not stored.
     targets
         Name of the target of each sighting, M.
     missed
         Beam error under the mechanism that was believed when the sighting was taken, rad, (M,); NaN
-        if recalled.
+        if the sighting was recalled.
     """
 
     sightings: Sightings
@@ -81,7 +81,10 @@ class Beliefs:
             self._growth |= dict.fromkeys(group.names, default_growth(group.mechanism))
 
     def subscribe(self, subscriber: Subscriber, *, held: bool = True) -> None:
-        """Call a function with each new calibration and, if ``held``, now with the current ones."""
+        """Call a function with each new calibration.
+
+        If ``held``, also call it now with each current calibration.
+        """
         self._subscribers.append(subscriber)
         for record in self._records.values() if held else ():
             subscriber(record)
@@ -114,7 +117,7 @@ class Beliefs:
         return self.nominal(heliostat).with_parameters(values)
 
     def record(self, heliostat: str) -> HeliostatCalibration | None:
-        """Return the current calibration; None before the first."""
+        """Return the current calibration of a heliostat; None before its first."""
         return self._records.get(heliostat)
 
     def growth(self, heliostat: str) -> Growth:
@@ -126,7 +129,7 @@ class Beliefs:
         return self._hyper.get(heliostat)
 
     def known(self, heliostat: str) -> KnownSightings | None:
-        """Return the known sightings; None if there are none."""
+        """Return the known sightings of a heliostat; None if there are none."""
         return self._known.get(heliostat)
 
     def count(self, heliostat: str) -> int:
@@ -144,7 +147,9 @@ class Beliefs:
     # -- taking --------------------------------------------------------------------------------
 
     def note(self, heliostat: str, target: str, new: Sightings) -> KnownSightings:
-        """Add sightings of a heliostat (row 0) on a target; return all known sightings.
+        """Add sightings of a heliostat on a target; return all its known sightings.
+
+        The new sightings have heliostat index 0.
 
         Sightings that the store failed to keep earlier are offered to it again.
         """
@@ -176,8 +181,8 @@ class Beliefs:
     def adopt(self, group: str, hyper: Hyperparameters, source: str) -> None:
         """Put the hyperparameters of a group of the design into force.
 
-        Later fits use them for the drift. The covariances of present calibrations grow by them from
-        now on, but their values stay unchanged until the next visit.
+        Later fits use them for the drift. From now on they determine how the covariances of present
+        calibrations grow; the calibrated values stay unchanged until the next visit.
         """
         growth, names = Growth.of(hyper, source), self.design.groups[group].names
         self._hyper |= dict.fromkeys(names, hyper)
@@ -196,7 +201,7 @@ class Beliefs:
         identities: Identities,
         targets: Sequence[str],
     ) -> None:
-        """Restore a calibration and its sightings from before a restart."""
+        """Restore a calibration, and its sightings, that were stored before a restart."""
         if len(sightings):
             unknown = np.full(len(sightings), np.nan)
             self._known[record.heliostat] = KnownSightings(

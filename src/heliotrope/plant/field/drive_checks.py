@@ -1,4 +1,4 @@
-"""Whether drives move their mirrors: today's measured evidence, and the drives that stall.
+"""Checks whether drives move their mirrors: today's measured evidence, and the stalled drives.
 
 Step counts are the steps that a board has sent to its motors. With ice, a loose coupling or an
 unpowered driver the mirror stays where it is while the counts continue. A motion diagnosis with a
@@ -141,7 +141,7 @@ class DriveChecks(Part):
         self._follows(heliostat)
 
     def confirm(self, heliostat: str) -> None:
-        """Accept a confirmation that the mirror follows its drives, which makes a diagnosis due."""
+        """Accept a confirmation that the mirror follows its drives; a diagnosis becomes due."""
         self._diagnosed.pop(heliostat, None)
         self._follows(heliostat)
 

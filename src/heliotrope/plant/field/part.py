@@ -21,7 +21,7 @@ class Part:
         """Handle a cluster's status, which the state of the field already contains."""
 
     def on_rows(self, cluster: str, now: float) -> None:
-        """Handle the rows of a cluster, once every part has handled its status."""
+        """Handle the rows of a cluster's status, once every part has handled the status."""
 
     def on_alarm(self, cluster: str, alarm: Alarm) -> None:
         """Handle an alarm of a cluster."""

@@ -90,12 +90,13 @@ class AutomaticSettings:
     Attributes
     ----------
     wanted
-        Whether all heliostats are wanted from the start; otherwise only those that `give_back`
-        names.
+        Whether all heliostats are wanted from the start; otherwise only heliostats passed to
+        `give_back`.
     calibrate
         Whether calibration is switched on at the start.
     rate
-        Number of heliostats that leave stow, and that go to the receiver, per second.
+        Number of heliostats that leave stow per second; the same number may go to the receiver per
+        second.
     beat
         Time between checks of the field, s.
     lowest
@@ -105,8 +106,8 @@ class AutomaticSettings:
     margin
         Clearance of an uncalibrated beam from the targets, standard deviations.
     losses
-        Number of heliostats that may be lost within 30 s; after more, it waits for an operator's
-        Resume.
+        Number of heliostats that may be lost within 30 s; after a larger loss, automatic control
+        waits for an operator's Resume.
     losses_share
         Fraction of the field that may be lost within 30 s, if that is fewer: in a small field the
         above number may be most of the field.
@@ -275,7 +276,7 @@ class AutomaticControl:
     def hold(
         self, person: Person, places: Sequence[tuple[Kind, str]], reason: str, hours: float
     ) -> tuple[str, ...]:
-        """Lock objects for a person; return the heliostats that stow. See `Operations.hold`."""
+        """Lock objects for a person; return the heliostats sent to stow. See `Operations.hold`."""
         names = self.service.take(person, places, reason, hours)
         self._withdraw(names, f"{person.name} took it out of service")
         return names
@@ -336,7 +337,7 @@ class AutomaticControl:
             self._calibrating.ask(heliostat, target, search=search)
 
     def _check_calibration(self, heliostats: Sequence[str]) -> None:
-        """Refuse a calibration that cannot be made; one that must wait a little is accepted."""
+        """Refuse a calibration that cannot be made; accept it if it must only wait a little."""
         idle, wanted = self._why_not(), self._raising.wanted
         for name in heliostats:
             why = "" if idle == _STARTING else idle
@@ -346,7 +347,7 @@ class AutomaticControl:
                 raise refusals.NO_CALIBRATION.error(heliostat=name, why=why)
 
     def _locked(self, heliostats: Sequence[str]) -> list[str | None]:
-        """Return the locks that keep heliostats from their aims, in words; None without a lock."""
+        """Return in words the locks that keep heliostats from their aims; None if there are none."""
         aims = self._plant.aims[[self._plant.field.place(name) for name in heliostats]]
         return self._plant.lockouts.reasons(heliostats, aims)
 
@@ -395,7 +396,7 @@ class AutomaticControl:
     def _up_step(self, name: str, state: int, age: float, waits: str, *, able: bool) -> Step:
         """Return the step of a heliostat that automatic control may move.
 
-        ``waits`` is what it waits for apart from its turn, "" for nothing.
+        ``waits`` is what the heliostat waits for, apart from its turn; "" if for nothing.
         """
         shown = self._plant.field.of(name, self._plant.now())
         if not shown.live:
@@ -420,7 +421,7 @@ class AutomaticControl:
         return bool(self._raising.wanted[self._plant.field.place(heliostat)])
 
     def visit_of(self, heliostat: str) -> Running | None:
-        """Return the visit of a heliostat that is in progress, None if there is none."""
+        """Return the visit of a heliostat that is in progress; None if there is none."""
         running = () if self._calibrating is None else self._calibrating.running.values()
         return next((one for one in running if heliostat in one.heliostats), None)
 
@@ -464,18 +465,18 @@ class AutomaticControl:
 
     @property
     def waits(self) -> str:
-        """Why it waits for an operator's Resume, empty if it does not."""
+        """Why automatic control waits for an operator's Resume; "" if it does not wait."""
         return self._losses.reason
 
     @property
     def to_resume(self) -> str:
-        """What an operator's Resume would do, empty if nothing waits for it."""
+        """What an operator's Resume would do; "" if nothing waits for a Resume."""
         left = 0 if self._plant.sentinel.on else int(self._raising.left.sum())
         after = f"The emergency is over: {left:,} heliostats wait until an operator presses Resume."
         return self.waits or (after if left else "")
 
     def left_by_emergency(self, heliostat: str) -> bool:
-        """Return whether an emergency has removed a heliostat, without a Resume since."""
+        """Return whether an emergency has removed a heliostat and no Resume has followed."""
         return bool(self._raising.left[self._plant.field.place(heliostat)])
 
     def resume(self) -> int:
@@ -531,7 +532,7 @@ class AutomaticControl:
 
     @property
     def idle(self) -> str:
-        """Why nothing is moved now, empty if heliostats may be moved."""
+        """Why nothing is moved now; "" if heliostats may be moved."""
         return self._why_idle() or ""
 
     def movable(self) -> npt.NDArray[np.bool_]:
@@ -629,7 +630,7 @@ class AutomaticControl:
         return grant is not None and grant.holder == AUTOMATIC and grant.token == self._token
 
     def _why_not(self) -> str | None:
-        """Return the reason why nothing is calibrated now, None if calibration may run."""
+        """Return why nothing is calibrated now; None if calibration may run."""
         if self._calibrating is None:
             return "there is no camera"
         if not self._on:
@@ -637,7 +638,7 @@ class AutomaticControl:
         return self._why_idle()
 
     def _why_idle(self) -> str | None:
-        """Return the reason why nothing is moved now, None if heliostats may be moved."""
+        """Return why nothing is moved now; None if heliostats may be moved."""
         if self._plant.sentinel.on:
             return "an emergency is active"
         if self.waits:
@@ -654,7 +655,10 @@ class AutomaticControl:
         return None
 
     async def _govern(self) -> None:
-        """Hold the authority while nobody else wants it; give up in an emergency and at night."""
+        """Hold the command authority while nobody else wants it.
+
+        Automatic control gives it up in an emergency and at night.
+        """
         plant, wanted = self._plant, self._raising.wanted
         if plant.sentinel.on:
             self._raising.give_up()
@@ -666,7 +670,7 @@ class AutomaticControl:
         self._night()
 
     def _night(self) -> None:
-        """Stow the wanted heliostats before the sun is low, and any found out of stow later."""
+        """Stow the wanted heliostats before the sun is low, and later any found out of stow."""
         now = self._plant.now()
         if now - self._sun_at < _SUN_EVERY:
             return
@@ -687,7 +691,7 @@ class AutomaticControl:
             self._log.event("plant", AUTOMATIC.name, "the sun is high enough")
 
     def _stow_up(self, *, told: bool) -> None:
-        """Stow the wanted heliostats that are up; with ``told``, report it even if none is."""
+        """Stow the wanted heliostats that are up; with ``told``, report this even if none is up."""
         up = self._plant.field.among(states.UP, self._plant.now()) & self._raising.wanted
         names = tuple(self._plant.field.names[row] for row in np.flatnonzero(up))
         if names:
@@ -715,13 +719,13 @@ class AutomaticControl:
         return self._losses.settling() | self.service.rows() | self._raising.given_up()
 
     async def _diagnose(self) -> None:
-        """Check daily, before heliostats are raised, that their drives move the mirrors."""
+        """Check every day, before heliostats are raised, that their drives move the mirrors."""
         if not self._why_idle():
             free = self._raising.wanted & ~self._left_alone()
             await self._checks.step(self._token, free)
 
     def _start_again(self, rows: npt.NDArray[np.intp]) -> None:
-        """Stow heliostats that cannot proceed from where they are; they are then raised again."""
+        """Stow heliostats that cannot proceed from where they are, so that they can be raised again."""
         if len(rows):
             names = tuple(self._plant.field.names[row] for row in rows)
             self._plant.stow(AUTOMATIC.name, names)

@@ -1,8 +1,8 @@
 """Errands: operations that involve several commands, followed to their result.
 
 An operator requests a calibration, takes a heliostat out of service, or gives it to automatic
-control. Each of these is a `Ticket` too: it states what each heliostat is doing or waiting for, and
-ends with the result, or with the reason why there is none.
+control. Each of these operations also has a `Ticket`, which states what each heliostat is doing or
+waiting for, and which ends with the result, or with the reason why there is none.
 """
 
 import math
@@ -17,7 +17,7 @@ from heliotrope.plant.orders.tickets import Ticket
 
 @dataclass(frozen=True)
 class Step:
-    """Progress of an operation for a heliostat: in words, and its stage; None: still waiting."""
+    """Progress of an operation for a heliostat: text and stage; a stage of None: still waiting."""
 
     text: str
     stage: Stage | None = None

@@ -19,7 +19,7 @@ _Case = tuple[str, str, str, Button]
 def explain(
     plant: PlantController, automatic: AutomaticControl, logbook: Logbook, name: str, on: str
 ) -> Explanation:
-    """Explain one heliostat.
+    """Explain why a heliostat tracks or not.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def explain(
     name
         Heliostat.
     on
-        Receiver or target at which it aims, "" for none.
+        Receiver or target at which the heliostat aims; "" if there is none.
 
     Raises
     ------

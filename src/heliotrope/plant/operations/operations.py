@@ -7,8 +7,8 @@ heliostat as plain values, `logbook` for alarms, events and packets, `automatic`
 plan and timetable.
 
 Operator commands pass through here so that automatic control knows what operators want: a heliostat
-that an operator has stowed, defocused or locked stays so until an operator gives it back, and a
-heliostat that is lost after an operator has raised it is left to the operators.
+that an operator has stowed, defocused or locked stays so until an operator gives it back. If a
+heliostat is lost after an operator has raised it, automatic control does not raise it again.
 """
 
 import asyncio
@@ -93,7 +93,7 @@ class Photographer(Protocol):
 
 @dataclass(frozen=True)
 class Photography:
-    """What a plant does with photographs.
+    """How a plant takes, stores and displays photographs.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class Operations:
     ----------
     plant, logbook, automatic, viewer, security, pictures, parameters, approvals, marking,
     flux_check
-        See their classes; readers access them directly.
+        The parts of the plant; see their classes. Callers access them directly.
     telemetry
         Folder of the telemetry; None: no telemetry is archived.
     begun
@@ -274,7 +274,7 @@ class Operations:
         return explain(self.plant, self.automatic, self.logbook, heliostat, on)
 
     async def journal(self, query: JournalQuery) -> list[JournalEntry]:
-        """Return events, alarms and commands of all days, the latest first.
+        """Return the events, alarms and commands of all days, the latest first.
 
         Raises
         ------
@@ -314,7 +314,8 @@ class Operations:
     ) -> Trend:
         """Return a quantity of the plant or of a heliostat over time; see `trends.trend`.
 
-        Without an end: until now; without a start: one day before the end.
+        The time span ends now if no end is specified, and begins one day before its end if no start
+        is specified.
         """
         if heliostat:
             self.plant.field.place(heliostat)
@@ -408,14 +409,14 @@ class Operations:
     ) -> Ticket:
         """Calibrate a heliostat, or only search for its beam, before all others.
 
-        With other heliostats (``together``) it is calibrated in one joint visit, as soon as all are
-        ready. With ``receiver`` it is measured while it tracks the receiver, as soon as all of them
-        do. The ticket ends with the result of the visit.
+        With other heliostats (``together``), the heliostat is calibrated in one joint visit, as
+        soon as all are ready. With ``receiver``, the heliostats are measured while they track the
+        receiver, as soon as all do. The ticket ends with the result of the visit.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer, or automatic control cannot do it now.
+            If the person is a viewer, or automatic control cannot calibrate the heliostat now.
         UnknownNameError
             If there is no such heliostat or target.
         """
@@ -438,7 +439,7 @@ class Operations:
         )
 
     async def photograph(self, person: Person, target: str) -> CameraView:
-        """Photograph a target now, with whatever beam is on it; return what is seen.
+        """Photograph a target now, with whatever beam is on it; return the findings.
 
         Raises
         ------
@@ -488,10 +489,10 @@ class Operations:
     ) -> Ticket:
         """Lock heliostats, targets, receivers or the tower with a person's own lock.
 
-        Locked heliostats go to stow, and nobody moves them; so do heliostats whose beams are aimed
-        at a locked target or receiver, and all heliostats under a locked tower. A locked object
-        returns to service when everyone has removed their lock. The ticket is done for a heliostat
-        once it is parked.
+        Locked heliostats go to stow, and nobody can move them. The same applies to heliostats whose
+        beams are aimed at a locked target or receiver, and to all heliostats if the tower is
+        locked. A locked object returns to service when everyone has removed their lock. The ticket
+        is done for a heliostat once it is parked.
 
         Parameters
         ----------
@@ -500,7 +501,7 @@ class Operations:
         heliostats, targets, receivers, tower
             What to lock.
         reason
-            Why.
+            Reason for the lock.
         hours
             Expected time until return to service, h; NaN if unknown. The lock remains beyond that
             time.
@@ -534,13 +535,13 @@ class Operations:
     ) -> None:
         """Remove a person's own locks; no heliostat moves.
 
-        An engineer may remove the locks of an ``owner`` who cannot, naming the owner and a reason.
+        An engineer may remove the locks of an ``owner`` who cannot remove them, stating a reason.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer, has no lock where others have one, or removes another
-            person's lock without being an engineer or without a reason.
+            If the person is a viewer, has no lock on an object that other persons have locked, or
+            removes another person's lock without being an engineer or without a reason.
         UnknownNameError
             If there is no such heliostat, target or receiver.
         """

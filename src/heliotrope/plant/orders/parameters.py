@@ -49,8 +49,9 @@ def change_of_beam(before: Tables, after: Tables, aims: npt.ArrayLike) -> float:
     """Return the largest angle by which new parameters rotate a beam off its aim, rad.
 
     The present parameters are assumed to describe the heliostat, while its local controller aims
-    with the new parameters, for sun directions all around. The angle is infinite if no pose can be
-    reached with the new parameters, or if an aim can be reached only with the present ones.
+    with the new parameters. The angle is the largest over sun directions all around; it is infinite
+    if no pose can be reached with the new parameters, or if an aim can be reached only with the
+    present parameters.
 
     Parameters
     ----------
@@ -118,7 +119,7 @@ class ParameterSync(Part):
     proofs
         Checks that a beam is clear where parameters are written, and at stow.
     blocked
-        Function that returns why nothing may be written to a heliostat, None if it may.
+        Function that returns why nothing may be written to a heliostat; None if writing is allowed.
     token
         Function that returns the token under which differences are written, 0 if none may be
         written now.
@@ -179,7 +180,7 @@ class ParameterSync(Part):
         self._strange.update(name for name in heliostats if name in self._wanted.items)
 
     def differing(self, heliostat: str) -> str | None:
-        """Return how the parameters of a heliostat differ or may differ, None if they agree.
+        """Return how the parameters of a heliostat differ or may differ; None if they agree.
 
         They may differ if the heliostat has not been compared since its cluster connected or its
         board started.
@@ -227,7 +228,7 @@ class ParameterSync(Part):
         token: int,
         before: Callable[[], None] = lambda: None,
     ) -> None:
-        """Send items of an accepted ticket once it is recorded; call ``before`` just before that.
+        """Send items of an accepted ticket once it is recorded; call ``before`` just before.
 
         The heliostat is compared when the ticket has ended.
         """
