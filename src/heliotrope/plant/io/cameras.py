@@ -63,7 +63,7 @@ def source_of(camera: Camera, folder: Path, stop: threading.Event) -> Source:
     Raises
     ------
     InputError
-        If there is no source, it is a recording, or its folder does not exist.
+        If there is no source, if the source is a recording, or if its folder does not exist.
     """
     who = f"camera {camera.name}"
     if not camera.source:
@@ -92,9 +92,9 @@ class Feed:
     Attributes
     ----------
     newest
-        The last frame, None before the first.
+        The last frame; None before the first frame.
     problem
-        Why no frame arrives, empty if nothing is wrong.
+        Why no frame arrives; "" if nothing is wrong.
     """
 
     def __init__(self, source: Source) -> None:
@@ -156,7 +156,7 @@ class RealCameras:
     watched
         Cameras of receivers that are monitored apart from receiver visits, by receiver name.
     memory
-        Folder for models of empty targets; None: they are learnt again at each start.
+        Folder for models of empty targets; None: the models are learnt again at each start.
     patience
         Longest wait for a frame, s.
     sources
@@ -237,7 +237,7 @@ class RealCameras:
         return self._views.view(target)
 
     def eye(self, target: str) -> Camera:
-        """Return the camera of a target, as currently known; see `plant.ports.Cameras`."""
+        """Return the camera of a target as it is now known; see `plant.ports.Cameras`."""
         return self._eye(target).camera
 
     def frame(self, target: str) -> Frame:
@@ -337,7 +337,7 @@ class RealCameras:
         return Exposed(at, asyncio.create_task(read()))
 
     async def _frame(self, eye: _Eye, target: str) -> Frame:
-        """Wait for a frame exposed from now on."""
+        """Wait for a frame that was exposed after this call."""
         asked, until = self._clock.utc(), self._clock.monotonic() + self._patience
         last = eye.feed.newest
         eye.feed.ask()

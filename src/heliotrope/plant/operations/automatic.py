@@ -3,8 +3,8 @@
 It commands under its own name. It takes the command authority while nobody else holds it, and
 yields at once: it starts nothing new, and visits in progress are completed. It moves only *wanted*
 heliostats. A heliostat that an operator stows, defocuses or locks is not wanted until an operator
-gives it back; after an emergency, none is. After the loss of a large number of heliostats it waits
-for an operator (`losses`).
+gives it back; after an emergency, no heliostat is wanted. After the loss of a large number of
+heliostats it waits for an operator (`losses`).
 """
 
 import asyncio
@@ -347,7 +347,7 @@ class AutomaticControl:
                 raise refusals.NO_CALIBRATION.error(heliostat=name, why=why)
 
     def _locked(self, heliostats: Sequence[str]) -> list[str | None]:
-        """Return in words the locks that keep heliostats from their aims; None if there are none."""
+        """Return in words the locks that keep heliostats from their aims; None if none do."""
         aims = self._plant.aims[[self._plant.field.place(name) for name in heliostats]]
         return self._plant.lockouts.reasons(heliostats, aims)
 
@@ -725,7 +725,7 @@ class AutomaticControl:
             await self._checks.step(self._token, free)
 
     def _start_again(self, rows: npt.NDArray[np.intp]) -> None:
-        """Stow heliostats that cannot proceed from where they are, so that they can be raised again."""
+        """Stow heliostats that cannot proceed from their present pose; they are then raised again."""
         if len(rows):
             names = tuple(self._plant.field.names[row] for row in rows)
             self._plant.stow(AUTOMATIC.name, names)

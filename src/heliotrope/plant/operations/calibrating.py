@@ -230,7 +230,7 @@ class Calibrating:
 
     @property
     def receiver(self) -> str:
-        """Name of the receiver on which heliostats are measured; "" if there is no such receiver."""
+        """Name of the receiver on which heliostats are measured; "" if there is none."""
         return "" if self._receiver is None else self._receiver.surface
 
     def ask_together(self, heliostats: Sequence[str], surface: str) -> None:
@@ -490,7 +490,7 @@ class Calibrating:
         return self._witness(fresh), False
 
     def _witness(self, ready: npt.NDArray[np.bool_]) -> str:
-        """Return a mask of heliostats whose photographs show the sun direction, if these are needed."""
+        """Return a heliostat whose photographs would show the sun direction; "" if not needed."""
         plant = self._plant
         if not plant.witnesses.awaits_photographs:
             return ""

@@ -88,7 +88,7 @@ class Requests:
         self._asked = [(names, surface) for names, surface in left if names]
 
     def next(self, surface: str, ready: Mask) -> tuple[str, ...]:
-        """Return the next group for a surface, once all its heliostats are ready, (N,); () if none."""
+        """Return the next group for a surface, once all its heliostats are ready; () if none is."""
         for i, (names, where) in enumerate(self._asked):
             if where in ("", surface) and ready[[self._place(name) for name in names]].all():
                 del self._asked[i]
@@ -196,7 +196,7 @@ class JointVisits:
         return tuple(names)
 
     def alone(self, ready: Mask) -> Mask:
-        """Return a mask of the ready heliostats (N,) that joint visits gave up, and that go alone."""
+        """Return a mask of the ready heliostats that joint visits gave up, (N,); they go alone."""
         found = np.zeros_like(ready)
         found[[self._plant.field.place(name) for name in self.cycle.attempts.given_up]] = True
         return found & ready
@@ -227,7 +227,7 @@ class JointVisits:
         return result.verdict is not None and self.cycle.searching(result.heliostat)
 
     def concluded(self, result: CycleResult) -> None:
-        """Note the result of a visit; raise or end the alarm about a beam not where it should be."""
+        """Note the result of a visit; raise or end the alarm that a beam is not as predicted."""
         self.cycle.note(result)
         name, kind = result.heliostat, alarms.BEAM_DISPROVED
         # Nothing predicts where the beam of an uncalibrated heliostat should be.

@@ -71,7 +71,7 @@ class Keeping:
         return self.lost or (self._records.problem if self._records is not None else "")
 
     def recall(self) -> None:
-        """Load the stored calibrations into the plant's beliefs; keep new calibrations from now on."""
+        """Load the stored calibrations into the plant's beliefs, and from now on keep new ones."""
         records = self._records
         if records is None:
             return

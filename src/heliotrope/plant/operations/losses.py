@@ -104,7 +104,7 @@ class Losses:
         return lost
 
     def settling(self) -> Mask:
-        """Return a mask of the heliostats that were lost recently and must not be raised yet, (N,)."""
+        """Return a mask of the heliostats lost recently that must not be raised yet, (N,)."""
         return np.asarray(self._plant.now() - self._lost_at < SPAN)
 
     def resume(self) -> None:

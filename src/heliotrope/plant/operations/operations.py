@@ -577,7 +577,7 @@ class Operations:
         *,
         tower: bool,
     ) -> list[tuple[Kind, str]]:
-        """Return the places to lock or give back, by kind and name."""
+        """Return the places to lock or unlock, by kind and name."""
         for name in heliostats:
             self.plant.field.place(name)
         for name in targets:
@@ -683,7 +683,7 @@ class Operations:
         Raises
         ------
         InputError
-            If the point is not on the receiver, or ``where`` is a target.
+            If the point is not on the receiver, or a point is specified and ``where`` is a target.
         UnknownNameError
             If there is no receiver or target of that name.
         """
@@ -747,7 +747,7 @@ class Operations:
         return order
 
     def withdraw(self, person: Person, owner: str = "") -> None:
-        """Withdraw the person's own emergency order, or an ``owner``'s as an engineer.
+        """Withdraw the person's own emergency order; an engineer may withdraw an ``owner``'s order.
 
         Raises
         ------
@@ -775,9 +775,10 @@ class Operations:
         self._tell(person, f"acknowledged {condition} {subject}".strip(), "command")
 
     def give_back(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
-        """Give heliostats (() for all) to automatic control, which raises and calibrates them.
+        """Return heliostats (() for all) to automatic control, which raises and calibrates them.
 
-        The ticket is done for a heliostat once it follows, and otherwise states why it does not.
+        The ticket is done for a heliostat once the heliostat follows automatic control; otherwise
+        it states why the heliostat does not.
 
         Raises
         ------
@@ -843,7 +844,7 @@ def _some(heliostats: Sequence[str]) -> str:
 
 
 def _named(places: Sequence[tuple[Kind, str]]) -> str:
-    """Return the locked places in words; heliostats by their bare names."""
+    """Return the locked places in words; heliostats appear as bare names."""
     bare = (Kind.HELIOSTAT, Kind.TOWER)
     return _some([name if kind in bare else f"{kind} {name}" for kind, name in places])
 

@@ -1,9 +1,9 @@
 """Calibration photographs, stored with their results and found by heliostat and time.
 
-The pictures are JPEG files in a folder, with one record each in `pictures.sqlite` beside them. They
-are thinned out by age, and the folder never exceeds its limit by more than one visit; the oldest
-are removed first. A disk failure costs pictures, never a calibration. The photographs of a coded
-visit are stored once, and found under each of its heliostats.
+The pictures are JPEG files in a folder, with one record each in `pictures.sqlite` beside them. Old
+pictures are thinned out, and the folder never exceeds its limit by more than one visit; the oldest
+pictures are removed first. A disk failure costs pictures, never a calibration. The photographs of a
+coded visit are stored once, and found under each of its heliostats.
 """
 
 import asyncio
@@ -119,7 +119,7 @@ class Pictures:
     Attributes
     ----------
     problem
-        Why the last picture could not be stored, empty if it was stored.
+        Why the last picture could not be stored; "" if it was stored.
     """
 
     def __init__(
@@ -260,7 +260,7 @@ class Pictures:
     def find(
         self, heliostat: str, limit: int, then: Callable[[list[PictureRow] | Exception], None]
     ) -> None:
-        """Call ``then`` with the newest pictures of a heliostat ("": requested by users)."""
+        """Call ``then`` with the newest pictures of a heliostat ("": pictures users requested)."""
 
         def work() -> list[PictureRow]:
             with self._table() as table:

@@ -16,5 +16,5 @@ def end_of_day(at: float, site: Site) -> float:
 
 
 def _ahead(site: Site) -> float:
-    """Return local mean solar time less UTC, s."""
+    """Return local mean solar time minus UTC, s."""
     return site.longitude_deg / 360.0 * _DAY

@@ -42,7 +42,7 @@ class Trend:
     Attributes
     ----------
     quantity, unit, heliostat
-        Name and unit of the quantity, and the heliostat; "": the plant.
+        Name and unit of the quantity, and the heliostat ("": the quantity belongs to the plant).
     at
         Middle of each interval with values, POSIX s, (K,).
     low, mean, high
@@ -86,9 +86,9 @@ def trend(
     Parameters
     ----------
     records, archive
-        The store, and the folder of the telemetry; None: there is none.
+        The store, and the folder of the telemetry; None: no telemetry is archived.
     quantity, heliostat
-        Name of the quantity, and the heliostat; "": the plant.
+        Name of the quantity, and the heliostat ("": the quantity belongs to the plant).
     since, until
         POSIX s.
     points

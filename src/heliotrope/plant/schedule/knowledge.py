@@ -358,7 +358,7 @@ class FieldKnowledge:
         )
 
     def fleets(self, now: float) -> tuple[tuple[Fleet, ...], Rows]:
-        """Return the heliostats for a plan, and their indices in that order; see `Knowledge.fleet`."""
+        """Return the heliostats for a plan, and their indices; see `Knowledge.fleet`."""
         names = np.array(list(self.row))
         sigma = self._settings.sigma
         found = tuple(
