@@ -23,9 +23,9 @@ class FluxLimit:
     ----------
     flux
         W/m²: a number, or a map over the receiver, (rows, columns), with the lowest row first and
-        columns ordered like those of its cells; rows and columns may be any number.
+        columns ordered like the columns of its cells; there may be any number of rows and columns.
     margin
-        Share of the flux that is reserved for the model's own error, 0 to 0.5.
+        Fraction of the flux that is reserved for the model's own error, 0 to 0.5.
     """
 
     flux: float | FloatArray
@@ -86,8 +86,8 @@ def read_limit(path: str | Path, margin: float = 0.0) -> FluxLimit:
     ----------
     path
         File without a header, with the highest row of cells first, as seen in front of the
-        receiver. The columns are ordered like those of the receiver: to the right, or clockwise
-        around a cylinder from the north.
+        receiver. The columns are ordered like the columns of the receiver: to the right, or
+        clockwise around a cylinder from the north.
     margin
         As for `FluxLimit`.
 

@@ -1,4 +1,4 @@
-"""Plot of a field: an overview, and some heliostats near the tower to scale."""
+"""Plots a field: an overview, and some heliostats near the tower to scale."""
 
 from typing import TYPE_CHECKING
 
@@ -37,7 +37,7 @@ def picture(plant: Plant) -> "Figure":
 
 
 def _numbers(plant: Plant) -> np.ndarray:
-    """Cluster number of each heliostat."""
+    """Return the cluster number of each heliostat."""
     names = [c for g in plant.groups.values() for c in (g.cluster or ("",) * len(g))]
     order = {name: k for k, name in enumerate(dict.fromkeys(names))}
     return np.array([order[name] for name in names])

@@ -1,4 +1,4 @@
-"""The centre of a generated field: targets with marks, their cameras, receivers."""
+"""The centre of a generated field: targets with marks, the targets' cameras, and receivers."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Surfaces of triangles, such as the panels of a receiver or the inside of a cavity."""
+"""Surfaces made of triangles, such as the panels of a receiver or the inside of a cavity."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +16,7 @@ _LEAST_AREA = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """Triangles, lit from the side from which their vertices run counter-clockwise.
+    """Triangles; the lit side is the one from which their vertices run counterclockwise.
 
     Attributes
     ----------
@@ -75,16 +75,17 @@ def cavity_wall(
     Parameters
     ----------
     radius, height
-        m. The axis passes through the middle of the aperture, in its plane.
+        Radius and height, m. The axis of the cylinder passes through the middle of the aperture, in
+        the aperture's plane.
     opening
         Angle of the sector, half of it on each side of straight back, rad.
     cells
-        Rows and columns of rectangles, each two triangles.
+        Rows and columns of rectangles, each made of two triangles.
 
     Returns
     -------
     TriangleMesh
-        In the axes of the aperture: right and up as seen from its front, and out of it.
+        The wall in the axes of the aperture: right and up as seen from its front, and outwards.
     """
     if not (radius > 0.0 and height > 0.0 and 0.0 < opening <= np.pi):
         raise InputError(

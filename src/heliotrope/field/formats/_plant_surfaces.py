@@ -1,4 +1,4 @@
-"""Targets and receivers in the text of a plant file, moved and rotated as rigid bodies.
+"""Moves and rotates targets and receivers in the text of a plant file, as rigid bodies.
 
 A surface moves together with everything attached to it: its corners, its additional known points
 and its marks. The tables are tomlkit tables, so that comments and the layout of the file are
@@ -111,7 +111,7 @@ def _axes(facing: float, tilt: float) -> FloatArray:
 
 
 def _angles(table: Any) -> tuple[float, float]:
-    """Return azimuth and elevation of the normal, degrees."""
+    """Return the azimuth and the elevation of the normal, degrees."""
     if "normal" in table:
         normal = normalize(np.array([float(x) for x in table["normal"]]))
     elif "corners_m" in table:
@@ -143,7 +143,7 @@ def _points(table: Any) -> Iterator[tuple[str, FloatArray]]:
 
 
 def _place(table: Any, name: str) -> Any:
-    """Return the array of a point of `_points`."""
+    """Return the TOML array of a point from `_points`."""
     kind, _, which = name.partition(".")
     if kind == "corners_m":
         return table[kind][int(which)]

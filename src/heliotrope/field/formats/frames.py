@@ -31,7 +31,7 @@ def mirror_frame(normal: npt.ArrayLike) -> FloatArray:
 
 
 def euler_matrix(angles: npt.ArrayLike) -> FloatArray:
-    """Return R = Rz·Ry·Rx, (..., 3, 3), of angles about x, y and z, rad, (..., 3)."""
+    """Return R = Rz·Ry·Rx, (..., 3, 3), for rotations about x, y and z by angles (..., 3), rad."""
     a = as_float(angles)
     sx, sy, sz = np.moveaxis(np.sin(a), -1, 0)
     cx, cy, cz = np.moveaxis(np.cos(a), -1, 0)

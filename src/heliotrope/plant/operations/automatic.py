@@ -725,7 +725,7 @@ class AutomaticControl:
             await self._checks.step(self._token, free)
 
     def _start_again(self, rows: npt.NDArray[np.intp]) -> None:
-        """Stow heliostats that cannot proceed from their present pose; they are then raised again."""
+        """Stow heliostats that cannot proceed from their present pose, to raise them again."""
         if len(rows):
             names = tuple(self._plant.field.names[row] for row in rows)
             self._plant.stow(AUTOMATIC.name, names)

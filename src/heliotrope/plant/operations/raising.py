@@ -141,7 +141,7 @@ class Raising:
             self.attempts.failed(self._plant.field.names[row], reason, self._plant.now())
 
     def given_up(self) -> Mask:
-        """Return a mask of the heliostats not raised for now because they failed too often, (N,)."""
+        """Return a mask of the heliostats not raised for now after too many failures, (N,)."""
         resting = np.zeros(len(self._plant.field), dtype=np.bool_)
         waiting = self.attempts.waiting(self._plant.now())
         resting[[self._plant.field.place(name) for name in waiting]] = True

@@ -105,7 +105,7 @@ class CycleResult:
     verdict: Verdict | None = None
 
     def then(self, again: "CycleResult") -> "CycleResult":
-        """Return the result combined with ``again``, the result of learning from the verification."""
+        """Return this result combined with ``again``, the result of the verification."""
         new, known = self.new + again.new, max(self.known, again.known)
         if again.record is None:
             return replace(self, known=known, new=new)
@@ -258,7 +258,7 @@ class CalibrationCycle:
         return root_mean_square(beam_errors(self._plant.beliefs.present(heliostat), seen).beam)
 
     def _witness(self, heliostat: str, taken: Photographs) -> str | None:
-        """Check the sun direction by photographs; return why not to learn from them; None if valid."""
+        """Check the sun direction by photographs; return why they must not be used, or None."""
         if not taken.used:
             return None
         beliefs = self._plant.beliefs

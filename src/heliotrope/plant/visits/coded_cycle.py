@@ -89,7 +89,7 @@ class Light:
     lasting: bool = False
 
     async def shown(self, picture: Exposed) -> bool:
-        """Return whether a photograph has the usual brightness; slowly update the usual brightness."""
+        """Return whether a photograph has the usual brightness, which is slowly updated."""
         if self.usual is None:
             return True
         level = (await picture.light).brightness
@@ -137,7 +137,7 @@ class _Taken:
     @classmethod
     @contextlib.contextmanager
     def of(cls, layout: Layout) -> "Iterator[_Taken]":
-        """Yield a store for the photographs of a layout; at the end, drop unevaluated photographs."""
+        """Yield a store for the photographs of a layout; finally drop unevaluated photographs."""
         taken = cls(len(layout.moves))
         try:
             yield taken
@@ -432,7 +432,7 @@ class CodedCycle(ABC):
         least: int | None = None,
         leaving: Leaving | None = None,
     ) -> CycleResult:
-        """Learn from an identified beam (see `CalibrationCycle.learn`); an error becomes a result."""
+        """Learn from an identified beam (`CalibrationCycle.learn`); an error becomes a result."""
         try:
             return await self.cycle.learn(
                 visit.visits[name], taken, confirming=confirming, least=least, leaving=leaving

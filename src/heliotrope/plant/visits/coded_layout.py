@@ -138,7 +138,7 @@ class SentBeam:
     step: FloatArray
 
     def movement(self, angle: float, axes: slice = slice(None)) -> float:
-        """Return the size of a movement along some axes, m; it is larger if the steps are coarse."""
+        """Return the size of a movement along some axes, m; it is larger for coarse steps."""
         return max(angle * self.slant, LEAST_STEPS * float(self.step[axes].max()))
 
 

@@ -270,7 +270,7 @@ class Returned:
         return self
 
     async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Send the heliostats back; an error that ended the visit takes precedence over a later error."""
+        """Send the heliostats back; an error that ended the visit takes precedence."""
         if kind is None:
             await self._back()
         elif issubclass(kind, Exception):

@@ -105,7 +105,7 @@ class CountsHeard:
         return np.asarray(rest[-1] + lag)
 
     def _counts(self, aims: FloatArray, heard: FloatArray) -> FloatArray:
-        """Return the step counts for aims (R + 1, 3), choosing those nearest to counts (R + 1, 2)."""
+        """Return the step counts for aims (R + 1, 3) that are nearest to counts (R + 1, 2)."""
         rows = np.zeros(len(aims), dtype=np.intp)
         drives = Drive(self.drives[rows])
         found = track(Armature(self.armature[rows]), self.suns, aims, drives=drives, current=heard)

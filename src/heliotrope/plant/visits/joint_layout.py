@@ -264,7 +264,7 @@ def newcomers(
 
 
 def _first_places(target: Target, sent: Mapping[str, SentBeam]) -> FloatArray:
-    """Return places, right of and above the centre, m, (M, 2); well-known beams are farthest out."""
+    """Return places, right of and above the centre, m, (M, 2); well-known beams go far out."""
     if not sent:
         return np.zeros((0, 2))
     half = np.abs(target.plane_coordinates(target.corners)).min(axis=0)

@@ -63,7 +63,7 @@ class CycleSettings:
 
     @property
     def first_model(self) -> str | tuple[str, ...]:
-        """The model for a heliostat with few sightings; every later model contains its parameters."""
+        """The model for a heliostat with few sightings; every later model has its parameters."""
         return SIMPLE if self.model == "auto" else self.model
 
 

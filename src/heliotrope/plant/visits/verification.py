@@ -118,7 +118,7 @@ class Verification:
         self._confirmed: dict[str, Photographs] = {}
 
     def confirmed(self, heliostat: str) -> Photographs | None:
-        """Return, only once, the photograph that confirmed a heliostat's last fit; None if none did."""
+        """Return the photograph that confirmed a heliostat's last fit, only once; else None."""
         return self._confirmed.pop(heliostat, None)
 
     def judge(
