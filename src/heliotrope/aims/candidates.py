@@ -53,7 +53,7 @@ class Candidates:
 
     @property
     def table(self) -> tuple[Any, ...]:
-        """The images in the form that the kernels take."""
+        """The images in the form that the kernels expect."""
         i = self.images
         return i.values, i.begin, i.box, i.looks, self.weight
 
@@ -64,7 +64,10 @@ class Candidates:
         return float(self.power[:, middle].sum())
 
     def worth(self, price: FloatArray, mirrors: IntArray | None = None) -> FloatArray:
-        """Return the sum of price (columns, rows) times flux of each candidate, (H, K · S)."""
+        """Return the sum over cells of price times flux, for each candidate, (H, K · S).
+
+        The prices are (columns, rows).
+        """
         chosen = np.arange(len(self.weight)) if mirrors is None else mirrors
         out = np.zeros(self.aims.shape[:2])
         price32, spans = price.astype(np.float32), spans_of(price)
@@ -97,12 +100,12 @@ def spans_of(price: FloatArray) -> IntArray:
 
 
 def surface_in(scene: Scene) -> Plate | Cylinder:
-    """Return the one receiver of a scene.
+    """Return the only receiver of a scene.
 
     Raises
     ------
     InputError
-        If there is more than one, or it has no rows and columns.
+        If there is more than one receiver, or the receiver has no rows and columns.
     """
     if len(scene.surfaces) != 1:
         names = ", ".join(surface.name for surface in scene.surfaces)
@@ -141,7 +144,8 @@ def candidates(engine: FieldFlux) -> Candidates:
     Parameters
     ----------
     engine
-        Flux engine of the scene, with aims on the receiver; `FieldFlux.images` says what is kept.
+        Flux engine of the scene, with aims on the receiver; see `FieldFlux.images` for what stays
+        constant.
 
     Raises
     ------

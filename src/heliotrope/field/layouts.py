@@ -287,7 +287,10 @@ def _two_fields(count: int, ground: Ground, pitch: float, step: Callable[[float]
 
 
 def _row_length(count: int, nearest: float, pitch: float, step: Callable[[float], float]) -> float:
-    """Return the number of places per row that makes a field of ``count`` mirrors about twice as wide as deep."""
+    """Return the number of places per row for a field of ``count`` mirrors.
+
+    The field is then about twice as wide as it is deep.
+    """
     north, rows_made = nearest, 0
     while rows_made * 2.0 * (north - nearest) / pitch < count:
         north += step(north)
@@ -328,7 +331,7 @@ def six_packs(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
 
 
 def _triangles(around: FloatArray, radius: float, step: float) -> FloatArray:
-    """Return triangles at azimuths (n,) on an arc, (n, 6, 2); odd-numbered triangles are reversed."""
+    """Return triangles at azimuths (n,) on an arc, (n, 6, 2); odd-numbered ones are reversed."""
     depth = 0.5 * np.sqrt(3.0) * step
     # Coordinates to the right of the bearing and outwards, from the middle of the triangle's
     # height.
@@ -350,7 +353,7 @@ def _triangles(around: FloatArray, radius: float, step: float) -> FloatArray:
 
 
 def _central(along: FloatArray, room: int) -> FloatArray:
-    """Return the middle part of a ring, row or arc with too many places."""
+    """Return the middle part of a ring, row or arc, as far as there is room."""
     first = max(0, (len(along) - room) // 2)
     return along[first : first + room]
 

@@ -26,7 +26,7 @@ class Target(Value):
     Attributes
     ----------
     name
-        Unique in the plant.
+        Name, unique in the plant.
     corners
         Upper left, upper right, lower right, lower left as seen from the front (the side that the
         beams come from), ENU metres, (4, 3).
@@ -35,7 +35,7 @@ class Target(Value):
     markers
         Additional known points by name, ENU metres.
     marks
-        Marks painted on the target that let cameras locate it.
+        Marks painted on the target, by which cameras locate the target.
     """
 
     name: str
@@ -98,12 +98,12 @@ class Target(Value):
 
     @property
     def width(self) -> float:
-        """Mean width, m."""
+        """Mean width of the target, m."""
         return float(np.linalg.norm(self._across))
 
     @property
     def height(self) -> float:
-        """Mean height, m."""
+        """Mean height of the target, m."""
         return float(np.linalg.norm(self._up))
 
     @cached_property
@@ -113,7 +113,7 @@ class Target(Value):
 
     @property
     def upside_down(self) -> bool:
-        """Whether the edge that is named upper is the lower one."""
+        """Whether the edge named upper is lower than the other edge."""
         return bool(self._up[2] < 0.0)
 
     @cached_property
@@ -131,7 +131,7 @@ class Target(Value):
         return self.center + np.asarray(plane, dtype=np.float64) @ self.axes
 
     def holds(self, points: npt.ArrayLike, off: float = _DEPTH) -> npt.NDArray[np.bool_]:
-        """Return the mask of ENU points (..., 3) that are on the target; NaN is not on it.
+        """Return a mask of the ENU points (..., 3) that are on the target; NaN counts as off it.
 
         A point is on the target if it is within the border and at most ``off`` m in front of or
         behind the surface.
@@ -161,7 +161,7 @@ class Receiver(Value):
     Attributes
     ----------
     name
-        Unique in the plant.
+        Name, unique in the plant.
     kind
         "planar", "convex_cylinder", "external_cylinder", "cavity" or "mesh".
     center
@@ -174,9 +174,9 @@ class Receiver(Value):
     corners
         Corners of the aperture in the order of `Target`, (4, 3), if known.
     radius, opening_angle
-        Curvature, m and rad; 0 if flat.
+        Radius of curvature, m, and opening angle, rad; 0 if flat.
     nominal_power
-        Power on it to which readings of its flux refer, W; 0: not known.
+        Power on the receiver to which its flux readings refer, W; 0: unknown.
     mesh
         Surface of a mesh, or inner surface of a cavity, in the axes `frame` about the centre, m.
     """
@@ -236,11 +236,11 @@ class Receiver(Value):
 
     @property
     def frame(self) -> FloatArray:
-        """Axes right and up as seen from the front, and out of it, as rows in ENU, (3, 3)."""
+        """Axes right, up (both as seen from the front) and outwards, as rows in ENU, (3, 3)."""
         return np.concatenate([self.aperture.axes, self.aperture.normal[None]])
 
     def point(self, right: float, up: float) -> FloatArray:
-        """Return a point on the surface, ENU m, (3,), from its position on the unrolled surface.
+        """Return the point, ENU m, (3,), at a position on the unrolled surface.
 
         Parameters
         ----------
@@ -284,7 +284,7 @@ class Receiver(Value):
         Raises
         ------
         InputError
-            If the receiver is of another kind.
+            If the receiver is of a different kind.
         """
         if self.kind != "planar":
             raise InputError(
@@ -295,7 +295,7 @@ class Receiver(Value):
 
     @cached_property
     def aperture(self) -> Target:
-        """The flat rectangle of its width and height about its centre."""
+        """The flat rectangle with the receiver's width and height about its centre."""
         corners = self.corners
         if corners is None:
             # An aperture that looks straight up or down has no upper edge of its own.
@@ -317,7 +317,7 @@ def point_of(
     aim
         Name of one of the targets, a target or receiver (its centre), or points.
     targets
-        Known by their names.
+        Targets that may be named.
 
     Raises
     ------

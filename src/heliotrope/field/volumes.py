@@ -120,9 +120,10 @@ Volume = Sphere | Box | Cylinder | Prism
 
 
 def around(receiver: Receiver, room: float) -> Volume:
-    """Return a volume that holds a receiver and ``room`` (m) on every side of it.
+    """Return a volume that contains a receiver and a margin ``room``, m, on every side.
 
-    An external cylinder is held by a cylinder, every other aperture by the ball about its centre.
+    An external cylinder is enclosed in a cylinder, every other aperture in a sphere about its
+    centre.
     """
     name = once(f"receiver {receiver.name}")
     name = "the receiver" if name == "receiver" else name
@@ -137,7 +138,7 @@ def around(receiver: Receiver, room: float) -> Volume:
 
 
 def around_target(target: Target, room: float) -> Volume:
-    """Return a ball that holds a target and ``room`` (m) on every side of it."""
+    """Return a sphere that contains a target and a margin ``room``, m, on every side."""
     name = once(f"target {target.name}")
     half = float(np.linalg.norm(target.corners - target.center, axis=1).max())
     return Sphere("the target" if name == "target" else name, target.center, half + room)

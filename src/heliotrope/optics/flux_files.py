@@ -1,4 +1,4 @@
-"""Files with the flux and the efficiencies of a plant, for people and for other programs.
+"""Writes the flux and the efficiencies of a plant to files, for people and other programs.
 
 - `write_heliostats`: one line per heliostat, with SolarPILOT's column names.
 - `write_map`: the flux on the receivers, one line per cell.
@@ -41,8 +41,8 @@ def write_heliostats(path: str | Path, found: PlantFlux, year: FluxTable | None 
 
     Notes
     -----
-    "Blocking" and "Shading" are computed separately; "Shading and blocking" is that of their exact
-    union, which enters the total.
+    "Blocking" and "Shading" are computed separately; "Shading and blocking" is the efficiency for
+    their exact union, which enters the total.
     """
     e = found.efficiencies
     columns: list[FloatArray] = [
@@ -80,7 +80,7 @@ def write_map(path: str | Path, found: PlantFlux) -> None:
 
 
 def write_netcdf(path: str | Path, found: PlantFlux) -> None:
-    """Write efficiencies and flux maps as NetCDF; W/m² and shares."""
+    """Write efficiencies (as fractions) and flux maps (W/m²) as NetCDF."""
 
     def write(stream: BinaryIO) -> None:
         # SciPy closes what it writes to.
@@ -162,14 +162,14 @@ def write_sam(path: str | Path, table: FluxTable) -> None:
 def write_solartherm(path: str | Path, table: FluxTable) -> None:
     """Write a table over a year in SolarTherm's format (.motab).
 
-    The table ``optics`` has the declination along rows and the hour angle along columns, in
+    The table ``optics`` has declinations along its rows and hour angles along its columns, in
     degrees, as in SolarTherm's ``Solar_angles.dec_hra``; the efficiency is 0 where the sun is below
     2°.
 
     Raises
     ------
     InputError
-        If the table is over times instead of a year.
+        If the table covers individual times instead of a year.
     """
     if not np.isfinite(table.declination).all():
         raise InputError(f"{path}: SolarTherm needs a table over a year; use flux_year")

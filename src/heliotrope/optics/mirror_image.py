@@ -102,8 +102,8 @@ class Beam:
         Raises
         ------
         InputError
-            If their samples do not lie on a common grid, as those of `reflected_beam` with one step
-            do.
+            If their samples do not lie on a common grid. The beams that `reflected_beam` returns
+            for the same step do.
         """
         step = beams[0].step
         places = np.array([beam.origin for beam in beams]) / step
@@ -121,7 +121,7 @@ class Beam:
 
     @cached_property
     def power(self) -> float:
-        """Power, W."""
+        """Power of the beam, W."""
         return float(self.flux.sum() * self.step**2)
 
     @cached_property
@@ -169,7 +169,7 @@ class Beam:
         return replace(self, origin=self.origin + as_float(by))
 
     def coarser(self, factor: int) -> "Beam":
-        """Return the beam with blocks of ``factor`` samples merged; power and centroid stay."""
+        """Return the beam with blocks of ``factor`` samples merged, at equal power and centroid."""
         if factor < 2:
             return self
         rows, columns = (-(-n // factor) for n in self.flux.shape)
@@ -187,7 +187,7 @@ class Beam:
         """Return the mean over an exposure in which the beam moves by metres right and up (2,).
 
         The beam moves uniformly about its position in the middle of the exposure, so the centroid
-        stays.
+        stays unchanged.
         """
         from scipy.signal import fftconvolve
 
@@ -206,7 +206,7 @@ class Beam:
     def on_target(self, target: Target) -> tuple[float, FloatArray]:
         """Return the fraction of the energy that falls on a target, and its centroid, m, (2,).
 
-        The centroid is NaN if that fraction is zero. Samples at the border count in part.
+        The centroid is NaN if that fraction is zero. Samples at the border are counted in part.
         """
         inside = coverage(
             [(target.plane_coordinates(target.corners) - self.origin) / self.step],

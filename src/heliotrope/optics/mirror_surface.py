@@ -1,4 +1,4 @@
-"""The surface of one mirror as small elements."""
+"""Divides the surface of a mirror into small elements."""
 
 import numpy as np
 
@@ -23,8 +23,8 @@ def equal_facets(width: float, height: float, count: tuple[int, int], focal: flo
     count
         Columns and rows.
     focal
-        Distance of the focus, m; infinity: all in one plane. The centres lie on the paraboloid z =
-        (x² + y²) / 4f, to which each facet is tangent at its centre.
+        Distance of the focus, m; infinity: all facets lie in one plane. The centres lie on the
+        paraboloid z = (x² + y²) / 4f, to which each facet is tangent at its centre.
     """
     for name, side in (("width", width), ("height", height)):
         if not (np.isfinite(side) and side > 0.0):
@@ -53,7 +53,7 @@ def elements_of(facets: Facets, focal: float, n: int) -> tuple[FloatArray, Float
     focal
         Focal length of each facet's own curvature, m; infinity: flat.
     n
-        Each facet is divided into the square of this number.
+        Each facet is divided into the square of this number of elements.
     """
     center, a, b = facets.center[0], facets.half_width[0], facets.half_height[0]
     grid = (np.arange(n) + 0.5) / n * 2.0 - 1.0

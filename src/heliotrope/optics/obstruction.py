@@ -49,7 +49,7 @@ class Neighbours:
     height: FloatArray
 
     def hide(self, points: FloatArray, way: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return the mask of points whose ray the neighbours obstruct, (E,).
+        """Return a mask of the points whose ray the neighbours obstruct, (E,).
 
         Parameters
         ----------
@@ -80,7 +80,7 @@ class Neighbours:
     def before(
         self, center: FloatArray, normal: FloatArray, size: tuple[float, float], *ways: FloatArray
     ) -> npt.NDArray[np.bool_]:
-        """Return the mask of neighbours that may hide part of a mirror, (J,): a quick check.
+        """Return a mask of the neighbours that may hide part of a mirror, (J,), by a quick check.
 
         The neighbours' corners are projected into the mirror plane, where their bounding boxes must
         overlap the mirror's.
@@ -120,8 +120,8 @@ class CentroidShift:
         Centroid with neighbours minus centroid without, right and up on the target plane, m, (2,);
         NaN if they hide the whole mirror.
     shaded, blocked, hidden
-        Fractions of the mirror area that are shaded, that are blocked on the way to the target, and
-        that are either.
+        Fractions of the mirror area that are shaded, blocked on the way to the target, and either
+        of the two.
     """
 
     shift: FloatArray

@@ -1,4 +1,4 @@
-"""Beams of heliostats at rest: over all sun positions of the year, and superposed in the air."""
+"""Beams of heliostats at rest: over all sun positions of the year, and their superposition."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,12 +24,14 @@ _PAIRS = 200_000
 
 
 def suns_of_the_year(latitude: float) -> FloatArray:
-    """Return unit vectors (S, 3), ENU, to all suns above the horizon, about 1° apart.
+    """Return unit vectors, ENU, (S, 3), to all sun positions of the year above the horizon.
+
+    The sun positions are about 1° apart.
 
     Parameters
     ----------
     latitude
-        rad, north positive.
+        Latitude, rad, north positive.
     """
     declination = np.arange(-_TROPIC, _TROPIC + _STEP, _STEP)
     hour = np.arange(-np.pi, np.pi, _STEP)
@@ -49,9 +51,10 @@ def entered_over_the_year(
     latitude: float,
     reach: float,
 ) -> npt.NDArray[np.bool_]:
-    """Return whether the beam of each standing mirror enters each volume in a year, (N, V).
+    """Return whether the beam of each mirror at rest enters each volume in a year, (N, V).
 
-    "Clear" is proven as in `keep_out`: each beam is widened by what lies between neighbouring suns.
+    As in `keep_out`, a result of "clear" is certain, because each beam is widened to cover the sun
+    positions between the computed ones.
 
     Parameters
     ----------
@@ -62,9 +65,9 @@ def entered_over_the_year(
     volumes
         V volumes.
     latitude
-        rad, north positive.
+        Latitude, rad, north positive.
     reach
-        Length over which a beam is followed, m.
+        Distance up to which the beams are followed, m.
     """
     entered = np.zeros((len(vertex), len(volumes)), dtype=np.bool_)
     suns = suns_of_the_year(latitude)
@@ -94,7 +97,7 @@ def _enters(
     volume: Volume,
     reach: float,
 ) -> bool:
-    """Return whether the beam of one mirror enters a volume with one of the suns (S, 3)."""
+    """Return whether the beam of one mirror enters a volume at any of the sun vectors (S, 3)."""
     count = len(suns)
     mirror = MirrorOptics(
         **{k: np.repeat(v[row : row + 1], count) for k, v in vars(mirrors).items()}
@@ -122,7 +125,7 @@ def standing_beams(
     mirrors
         N mirrors.
     reach
-        Length over which they are followed, m.
+        Distance up to which the beams are followed, m.
     """
     rays = np.ascontiguousarray(reflect(np.broadcast_to(sun, normal.shape), normal))
     return Beams(np.ascontiguousarray(vertex), rays, mirrors, np.full(len(vertex), reach))
@@ -130,16 +133,18 @@ def standing_beams(
 
 @dataclass(frozen=True)
 class Hottest:
-    """The place where the beams of a field together are strongest.
+    """The place where the beams of a field, taken together, are strongest.
 
     Attributes
     ----------
     suns
-        Irradiance on a surface that faces each beam, over that of the sun.
+        Sum of the beams' irradiances, each on a surface that faces the beam, as a multiple of the
+        direct sun.
     point
         ENU, m, (3,).
     reach
-        Largest distance from the centre at which more than the limit was found, m; 0: nowhere.
+        Largest distance from the centre at which more than the limit was found, m; 0 if it was
+        found nowhere.
     """
 
     suns: float
@@ -148,10 +153,10 @@ class Hottest:
 
 
 def hottest(beams: Beams, center: FloatArray, around: float, limit: float = 10.0) -> Hottest:
-    """Return where beams are strongest together, near a place in the air.
+    """Return where beams, taken together, are strongest near a place in the air.
 
-    Points on the beams' axes are asked first, evenly chosen, then the neighbourhood of the best of
-    them: a narrow peak between them may be missed.
+    First, evenly spaced points on the beams' axes are evaluated, then the neighbourhood of the best
+    of these points. A narrow peak between the points may be missed.
 
     Parameters
     ----------
@@ -160,9 +165,9 @@ def hottest(beams: Beams, center: FloatArray, around: float, limit: float = 10.0
     center
         The middle of the search, such as a receiver's, ENU, m, (3,).
     around
-        How far from it each beam is followed, m.
+        Distance from the centre up to which each beam is followed, m.
     limit
-        Suns of `Hottest.reach`.
+        Limit for `Hottest.reach`, in suns.
     """
     near = np.einsum("nk,nk->n", center - beams.origin, beams.direction)
     points = beams.point(near[:, None] + np.linspace(-around, around, _ALONG)).reshape(-1, 3)

@@ -369,7 +369,7 @@ class PlantAssembly:
         return not self.left()
 
     def _on_the_way(self, now: float) -> npt.NDArray[np.bool_]:
-        """Return a mask of the heliostats that an order sends to stow and that are not yet there, (N,)."""
+        """Return a mask of the heliostats that are on their way to stow by an order, (N,)."""
         rows = self.plant.field
         away = (rows.age(now) <= SILENT) & ~(rows.live(now) & at_stow(rows.rows))
         # In these states, only the motion shows whether a heliostat obeys STOW.

@@ -25,7 +25,7 @@ def purge(folder: Path) -> tuple[int, list[Path]]:
 
     Returns
     -------
-    The number of removed files, and what is left in the folder because no plant created it.
+    The number of removed files, and the files left in the folder because no plant created them.
 
     Raises
     ------

@@ -96,7 +96,7 @@ def build_group(
 
 
 class _Reader:
-    """Reads the numbers of one group: from a column of the table if it exists, else from the TOML."""
+    """Reads the numbers of one group: from a table column if there is one, else from the TOML."""
 
     def __init__(
         self,

@@ -164,7 +164,10 @@ def _gridded(
     normals: FloatArray,
     cells: int,
 ) -> FloatArray:
-    """Return the mean deviation in each cell of facet ``k``, (cells, cells, 2); NaN in empty cells."""
+    """Return the mean deviation in each cell of facet ``k``, (cells, cells, 2).
+
+    Empty cells are NaN.
+    """
     facets, curve = mirror
     axes, half = facets.axes[0, k], facets.half_size[0, k]
     own = normals @ axes.T

@@ -444,7 +444,7 @@ class _Run:
     def _map(
         self, stage: str, work: Callable[[Task], Result], tasks: Sequence[Task]
     ) -> list[Result]:
-        """Return the result of ``work`` for each task, in order; the first failure ends all tasks."""
+        """Return the result of ``work`` for each task, in order; a failure ends all tasks."""
 
         def run_task(task: Task) -> Result:
             result = work(task)

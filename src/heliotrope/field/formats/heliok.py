@@ -481,7 +481,7 @@ def _named(placed: list[PlacedSurface]) -> Iterator[tuple[PlacedSurface, str]]:
 
 
 def _corners(surface: Surface) -> FloatArray:
-    """Return the corners of a surface: upper left, upper right, lower right, lower left, m, (4, 3)."""
+    """Return the upper left, upper right, lower right and lower left corners, m, (4, 3)."""
     across = 0.5 * surface.width * surface.axes[:, 0]
     up = 0.5 * surface.height * surface.axes[:, 1]
     corners = np.array([up - across, up + across, across - up, -across - up])

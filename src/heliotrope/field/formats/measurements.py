@@ -98,7 +98,7 @@ def read_measurements(folder: str | Path, centroid: Centroid = "utis") -> Measur
 
 
 def _read_table(path: Path, centroid: Centroid) -> "tuple[pd.DataFrame, list[str]]":
-    """Return the rows of a table, and a message for each row whose length differs from the header's."""
+    """Return the rows of a table, and a message for each row that is not as long as the header."""
     import pandas as pd
 
     needed = [*_COLUMNS, *(f"{centroid}_{c}" for c in ("lat", "lon", "alt"))]

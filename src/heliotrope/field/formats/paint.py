@@ -296,7 +296,7 @@ def find_properties(folder: str | Path) -> list[Path]:
 
 
 def heliostat_of(file: Path) -> str:
-    """Return the heliostat to which a PAINT or ARTIST file belongs, from its folder; "" if unknown."""
+    """Return the heliostat of a PAINT or ARTIST file, known from its folder; "" if unknown."""
     if file.parent.name in ("Properties", "Calibration"):
         return file.parent.parent.name
     own = (file.parent / "heliostat-properties.json").exists()

@@ -117,7 +117,7 @@ class JointCycle(CodedCycle):
             self.attempts.give_up(name, text, now)
 
     def first(self, heliostats: Sequence[str], target: Target) -> bool:
-        """Return whether a visit needs individual codes: some heliostats are new or hardly known."""
+        """Return whether a visit needs individual codes for new or poorly known heliostats."""
         errors = errors_on(self._plant, target, heliostats, self.settings).values()
         return bool(self.settings.first) and not all(e <= self.settings.known for e in errors)
 

@@ -1,6 +1,7 @@
 """The first tables.
 
-A copy of `store.tables` at that time, because a migration must not change with the program.
+This module is a copy of `store.tables` at that time, because a migration must not change with the
+program.
 """
 
 from alembic import op
@@ -267,5 +268,5 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Make the tables."""
+    """Create the tables."""
     metadata.create_all(op.get_bind(), checkfirst=False)

@@ -15,7 +15,7 @@ _ENDINGS = {
 
 
 def upgrade() -> None:
-    """Add the columns, and name what stood there as a sentence."""
+    """Add the columns, and convert outcomes stored as sentences to names."""
     op.add_column(
         "parameter_version", Column("provenance", Text, nullable=False, server_default="camera")
     )
