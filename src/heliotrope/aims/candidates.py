@@ -86,13 +86,13 @@ class Candidates:
         return flux
 
     def relit(self, weight: FloatArray) -> "Candidates":
-        """Return the candidates with a different amount of light on each mirror, (H,)."""
+        """Return the candidates for a different amount of light on each mirror, (H,)."""
         ratio = weight / np.where(self.weight > 0.0, self.weight, 1.0)
         return replace(self, weight=weight, power=as_float(self.power * ratio[:, None]))
 
 
 def spans_of(price: FloatArray) -> IntArray:
-    """Return the first and end row of each column's nonzero prices, (columns, 2)."""
+    """Return the first and the end row of the nonzero prices in each column, (columns, 2)."""
     some = (price > 0.0).astype(np.int64)
     first = some.argmax(axis=1)
     end = price.shape[1] - np.flip(some, axis=1).argmax(axis=1)
@@ -125,7 +125,10 @@ def middles(scene: Scene) -> FloatArray:
 
 
 def _across(scene: Scene, offset: FloatArray) -> FloatArray:
-    """Return points on the receiver, at offsets (H, K) to the right as seen, m, (H, K, 3)."""
+    """Return points on the receiver, (H, K, 3), at offsets (H, K) to the right, m.
+
+    Right is as seen from each mirror.
+    """
     surface = surface_in(scene)
     if isinstance(surface, Plate):
         return as_float(surface.center + offset[..., None] * surface.right)

@@ -73,12 +73,12 @@ class AimPlan(Value, Framed):
 
     @property
     def gap(self) -> float:
-        """Upper bound on the power that better aims could add, as a fraction; NaN if none."""
+        """Upper bound on the power that better aims could add, as a fraction; NaN if unknown."""
         return self.scene.choice.gap
 
     @property
     def excess(self) -> float:
-        """Largest ratio of the flux quantile to the limit, minus 1; ≤ 0 if the limit holds."""
+        """Largest ratio of the flux quantile to the limit, minus 1; not above 0 if it holds."""
         return self.scene.excess
 
     @property
@@ -97,7 +97,10 @@ class AimPlan(Value, Framed):
         return self.scene.gain
 
     def deviation(self, wanted: "FluxLimit | npt.ArrayLike") -> float:
-        """Return the RMS difference of the flux from a wanted map of equal mean, over the mean."""
+        """Return the RMS difference between the flux and a wanted map, divided by the mean.
+
+        The wanted map is scaled to the same mean.
+        """
         flux = self.light.flux
         return deviation(flux, FluxLimit.of(wanted).on(*flux.shape))
 

@@ -350,7 +350,10 @@ class _Walk:
         return stuck[: min(self._now.together, self._now.most - self._moved)]
 
     def relieved(self, rows: Rows) -> list[Move]:
-        """Rest mirrors while cells are above the limit, the most effective first, all at once."""
+        """Rest mirrors, the most effective first, until no cell is above the limit.
+
+        All these mirrors rest in a single move.
+        """
         resting: list[int] = []
         lighting = [int(row) for row in rows]
         while lighting:
@@ -372,7 +375,10 @@ class _Walk:
 
 
 def _best(now: Round, demand: Demand, light: dict[str, Any]) -> SceneAims:
-    """Return the aims of maximum power, starting from this process's earlier aims if they fit."""
+    """Return the aims of maximum power.
+
+    The search starts from this process's earlier aims if they fit the scene.
+    """
     scene = replace(now.scene, dark=~now.free)
     at, start = now.at, None
     if _last:

@@ -218,7 +218,10 @@ def _shaped(scene: Scene, best: SceneAims, demand: Demand, light: dict[str, Any]
 
 
 def deviation(flux: FloatArray, wanted: FloatArray) -> float:
-    """Return the RMS difference of a flux from a wanted map of equal mean, over the mean."""
+    """Return the RMS difference between a flux and a wanted map, divided by the mean.
+
+    The wanted map is scaled to the same mean.
+    """
     return float(np.sqrt(np.mean((flux / flux.mean() - wanted / wanted.mean()) ** 2)))
 
 
@@ -273,7 +276,7 @@ def _part(progress: Step | None, done: int) -> Step | None:
 
 
 def _posed(scene: Scene, aims: FloatArray, off: npt.NDArray[np.bool_] | None) -> Scene:
-    """Return the scene with other aims, and more mirrors dark."""
+    """Return the scene with new aims, and with additional mirrors dark."""
     dark = scene.dark
     if off is not None:
         dark = off if dark is None else dark | off

@@ -277,7 +277,7 @@ def distort(
 
 
 def project(camera: Camera, points: npt.ArrayLike) -> FloatArray:
-    """Return the pixels (..., 2) of points, ENU metres (..., 3); NaN behind the camera.
+    """Return the pixels (..., 2) of points in ENU, m, (..., 3); NaN for points behind the camera.
 
     Raises
     ------
@@ -289,7 +289,7 @@ def project(camera: Camera, points: npt.ArrayLike) -> FloatArray:
 
 
 def undistort(camera: Pinhole, pixels: npt.ArrayLike) -> FloatArray:
-    """Return the undistorted normalised coordinates x/z, y/z (..., 2) of pixels (..., 2)."""
+    """Return the undistorted normalised coordinates x/z, y/z of pixels (..., 2), (..., 2)."""
     import cv2
 
     array = as_float(pixels)
@@ -321,9 +321,9 @@ def rays(camera: Camera, pixels: npt.ArrayLike) -> FloatArray:
 
 
 def look_at(position: npt.ArrayLike, point: npt.ArrayLike) -> FloatArray:
-    """Return R_enu_camera (3, 3) of a level camera at ``position`` that looks at ``point``.
+    """Return R_enu_camera, (3, 3), for a level camera at ``position`` that looks at ``point``.
 
-    If it looks straight down or up, the camera's right is east.
+    If the camera looks straight down or up, its right is east.
     """
     forward = normalize(as_float(point) - as_float(position), "line of sight")
     right = np.cross(forward, [0.0, 0.0, 1.0])

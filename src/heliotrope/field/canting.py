@@ -1,11 +1,12 @@
 """Canting: how the facets of a mirror are tilted towards a focus.
 
-The facets of a heliostat lie in the plane of its mirror. SolarPILOT's canting methods:
+The facets of a heliostat lie in the plane of its mirror. SolarPILOT has two canting
+methods:
 
 - on-axis, for one focal length, for one focal length per heliostat, or for each heliostat's
   distance to its aim: to first order in the size of the mirror, the facets are tangent to a
-  paraboloid; - off-axis, for one moment: at that moment, and only then, every facet sends the
-  centre of the sun
+  paraboloid;
+- off-axis, for one moment: at that moment, and only then, every facet sends the centre of the sun
   to the aim.
 """
 

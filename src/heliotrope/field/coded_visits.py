@@ -1,7 +1,8 @@
 """Settings of coded visits: several heliostats measured at once, identified by their movements.
 
-They belong to a plant, because they depend on its targets, receiver, heliostats and drives. Each
-number is defined once, in this module, with its unit in the plant file, its limits and its meaning.
+These settings belong to a plant, because they depend on its targets, receiver, heliostats and
+drives. Each number is defined once, in this module, with its unit in the plant file, its limits and
+its meaning.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The tracking of a heliostat, or of a plant, through one day."""
+"""Tracks a heliostat, or a plant, through one day."""
 
 from dataclasses import dataclass
 from datetime import date, timedelta

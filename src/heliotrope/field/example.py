@@ -1,8 +1,8 @@
 """Our own example plant of 18 heliostats, with finer gears and larger mirrors than the prototype.
 
-Six groups of three heliostats of 2.2 m², south of a tower at Stellenbosch with a target 13 m above
-ground. One of them stands where Malan calibrated his heliostat (30.8 m south, 19.2 m east, pivot
-height 1.2 m). Malan's own plant is `stellenbosch.prototype`.
+It has six groups of three heliostats of 2.2 m² each, south of a tower at Stellenbosch with a target
+13 m above ground. One of them stands where Malan calibrated his heliostat (30.8 m south, 19.2 m
+east, pivot height 1.2 m). Malan's own plant is `stellenbosch.prototype`.
 """
 
 import numpy as np

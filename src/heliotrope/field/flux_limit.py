@@ -54,7 +54,7 @@ class FluxLimit:
         return limit if isinstance(limit, FluxLimit) else cls(as_float(limit))
 
     def on(self, rows: int, columns: int) -> FloatArray:
-        """Return the allowable flux of each cell, less the margin, W/m², (rows, columns).
+        """Return the allowable flux of each cell minus the margin, W/m², (rows, columns).
 
         A cell gets the smallest value of the map cells that it overlaps, so that a finer grid never
         allows more.

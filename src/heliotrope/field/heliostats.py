@@ -85,7 +85,7 @@ class Facets(Value):
 
     @cached_property
     def half_size(self) -> FloatArray:
-        """Half the width and the height of each facet, m, (N, F, 2)."""
+        """Half the width and half the height of each facet, m, (N, F, 2)."""
         up = np.sum(self.half_height * self.axes[..., 1, :], axis=-1)
         return np.stack([np.linalg.norm(self.half_width, axis=-1), up], axis=-1)
 
@@ -236,7 +236,7 @@ class Heliostats(Value, Framed):
 
     @property
     def mirror(self) -> str:
-        """Sizes of the mirrors in one phrase: "1.83 × 1.22 m"."""
+        """Sizes of the mirrors in words, such as "1.83 × 1.22 m"."""
         return f"{span(self.width)} × {span(self.height)} m"
 
     def __len__(self) -> int:

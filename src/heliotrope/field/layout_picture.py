@@ -20,7 +20,7 @@ _PART = 14.0
 def picture(plant: Plant) -> "Figure":
     """Return the picture of a plant: heliostats by cluster, targets, cameras, receiver.
 
-    On the right some mirrors near the tower are drawn to scale, each lying flat, with its turning
+    On the right, some mirrors near the tower are drawn to scale, each lying flat in its turning
     circle.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg

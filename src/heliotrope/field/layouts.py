@@ -94,7 +94,7 @@ class HeliostatSize:
 
     @property
     def reach(self) -> float:
-        """Least distance between two pivots, m: a diagonal, both offsets, and the clearance."""
+        """Smallest distance between two pivots, m: a diagonal, both offsets, and the clearance."""
         swing = np.hypot(np.hypot(self.width, self.height) / 2.0, self.pivot_offset)
         return float(2.0 * swing + self.clearance)
 
@@ -397,7 +397,7 @@ TWO_SIDED = ("rows", "twin-field")
 
 
 def clusters(count: int, size: int = CLUSTER) -> tuple[str, ...]:
-    """Return the cluster of each heliostat in the order of their positions, from "C001" on."""
+    """Return the cluster of each heliostat, from "C001" on, in the order of positions."""
     return tuple(f"C{1 + i // size:03d}" for i in range(count))
 
 
@@ -494,10 +494,10 @@ def _lights(
     things: Sequence[tuple[FloatArray, float]],
     latitude: float,
 ) -> npt.NDArray[np.bool_]:
-    """Return whether any sun position of the year sends stationary beams to things, (N,).
+    """Return whether, at any sun position of the year, beams at rest hit ``things``, (N,).
 
-    All sun positions from which a beam comes within reach of a thing lie in a cone; the sun may be
-    in this cone if it reaches above the horizon and between the tropics.
+    All sun positions at which a beam comes within the radius of a thing lie in a cone; the sun may
+    be in this cone if it reaches above the horizon and between the tropics.
     """
     normal, vertex = pose
     pole = np.array([0.0, np.cos(latitude), np.sin(latitude)])
@@ -617,7 +617,7 @@ def _tower_height(heliostats: int, mirror: HeliostatSize) -> float:
 def _middle(
     height: float, pivot: float, facing: float, both: bool
 ) -> tuple[tuple[Target, ...], tuple[Camera, ...], Receiver]:
-    """Return targets, cameras and the receiver, in proportion to the height of the tower."""
+    """Return targets, cameras and the receiver, sized in proportion to the tower's height."""
     share = height / 80.0
     aside, up, away = 45.0 * share, 36.0 * share, 150.0 * share
     right = direction(facing - 0.5 * np.pi, 0.0)

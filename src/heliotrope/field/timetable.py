@@ -104,7 +104,7 @@ class TimetableEntry:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The entry with the keys of the plant file; values that are not set are left out."""
+        """The entry as a document with the keys of the plant file; unset values are left out."""
         rest: dict[str, Any] = {"target": self.target, "at": list(self.at), "every_s": self.every}
         rest["rule"] = self.rule
         settings = {key: value for key, value in rest.items() if value}

@@ -12,8 +12,8 @@
 - `mirror_image`: the flux of one heliostat on a target, for photographs and their simulation.
 - `obstruction`: the mirror elements that neighbours shade and block, and the resulting centroid
   shift.
-- `coverage`: the fraction of a grid's cells that polygons cover (a function of the same name, so it
-  stays there).
+- `coverage`: the fraction of each grid cell that polygons cover; import the function from this
+  module, because both have the same name.
 - `keep_out`: beams that enter keep-out volumes; `glare`: the eye hazard, for information only.
 
 Begin with `image_offsets` for a tracking error, `field_flux` for a plant.

@@ -129,7 +129,7 @@ def candidates(rows, mirrors, sun, rays, reaches, slack, grid, spans):
 
 @njit(**INLINED)
 def _cut(corners, m, into, axis_x, axis_y, axis_z, offset):
-    """Clip a polygon in space to axis · p ≤ offset; return its number of corners."""
+    """Clip a polygon in space to axis · p ≤ offset; return the new number of corners."""
     count = 0
     for k in range(m):
         k2 = k + 1 if k + 1 < m else 0

@@ -104,7 +104,7 @@ def _turn(row, sun, cosine, axes, into):
 
 @njit(**INNER)
 def _blur(row, sun, cosine, axes, slope, pointing, turn):
-    """Variances (uu, uv, vv) of the beam direction due to slope and calibration errors, rad²."""
+    """Covariance (uu, uv, vv) of the beam direction due to slope and calibration errors, rad²."""
     _turn(row, sun, cosine, axes, turn)
     s = slope * slope
     uu = s * (turn[0, 0] ** 2 + turn[0, 1] ** 2) + pointing[0, 0]

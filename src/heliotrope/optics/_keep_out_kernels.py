@@ -65,7 +65,7 @@ def _extruded(flat, along):
 
 @njit(**INNER)
 def _polygon(corners, first, last, x, y):
-    """Signed distance of (x, y) from a polygon, negative inside (an odd number of crossings)."""
+    """Signed distance of (x, y) from a polygon; negative inside (odd number of crossings)."""
     best, inside = math.inf, False
     for i in range(first, last):
         j = i - 1 if i > first else last - 1
@@ -80,7 +80,7 @@ def _polygon(corners, first, last, x, y):
 
 @njit(**OPTIONS)
 def distances(table, corners, points, out):
-    """Signed distances of points (P, 3) from volumes (V, SIZE) into out (P, V)."""
+    """Write the signed distances of points (P, 3) from volumes (V, SIZE) into ``out`` (P, V)."""
     for i in range(len(points)):
         p = (points[i, 0], points[i, 1], points[i, 2])
         for v in range(len(table)):

@@ -45,7 +45,7 @@ def cover_edges(edges, area):
 
 @njit(**INLINED)
 def _cover_row(line, left, right, height, columns):
-    """Spread one row's part of an edge over the cells from ``left`` to ``right``."""
+    """Distribute one row's part of an edge over the cells from ``left`` to ``right``."""
     if right <= 0.0:
         line[0] += height
         return

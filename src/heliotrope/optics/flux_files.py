@@ -148,7 +148,7 @@ def _put(
 
 
 def write_sam(path: str | Path, table: FluxTable) -> None:
-    """Write a table over sun positions in SAM's format for power towers (CSV).
+    """Write efficiencies over sun positions in SAM's format for power towers (CSV).
 
     Each line contains the sun's azimuth (clockwise from north) and zenith angle in degrees, and the
     optical efficiency of the field, without a header: the matrix ``eta_map`` of SSC's

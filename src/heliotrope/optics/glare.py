@@ -38,7 +38,7 @@ SMALLEST = 1e-6
 
 @dataclass(frozen=True)
 class Eye:
-    """An eye: pupil (m; daylight-adapted), focal length (m), transmittance of the ocular media."""
+    """An eye: daylight-adapted pupil (m), focal length (m), transmittance of the ocular media."""
 
     pupil: float = 2e-3
     focal_length: float = 17e-3
@@ -212,10 +212,10 @@ def _corner(light: FloatArray, room: FloatArray) -> tuple[FloatArray, FloatArray
 def glare_at(
     given: Beams, points: npt.ArrayLike, *, dni: float = NOMINAL_DNI, eye: Eye = DAYLIGHT
 ) -> Glare:
-    """Return the hazard to an eye at points (P, 3) that looks into the beams.
+    """Return the hazard to an eye that looks into the beams from points (P, 3).
 
     Each beam is a source as wide as the part of its mirror in which the sun is visible. A mirror
-    with concentration C subtends ω = 2 β √C, since it shows the sun at the sun's radiance.
+    with concentration C subtends ω = 2 β √C, because it shows the sun at the sun's radiance.
     """
     _irradiance(dni)
     concentration = crossing(given, points, dni=dni).concentration
@@ -286,7 +286,7 @@ class GlareMap:
 
     @property
     def radius(self) -> float:
-        """Largest distance from the point at which a look may burn, m; 0 if it burns nowhere."""
+        """Largest distance from the point at which a look may cause a burn, m; 0 if none may."""
         bad = self.glare.hazard == Hazard.DAMAGE
         away = np.hypot(*np.meshgrid(self.right, self.up))
         return float(np.max(np.where(bad, away, 0.0)))

@@ -3,13 +3,11 @@ r"""Computes the intercept: the fraction of a heliostat's beam that enters the r
 There are two models:
 
 - `intercept_circle` and `intercept_rectangle` are our own model: the beam is Gaussian, with the
-  standard
-  deviation σ of `beam_sigma` on the aperture plane. A centred circle of radius R intercepts $1 -
-  \exp(-R^2 / 2 σ^2)$. Every σ is a standard deviation *per axis*; the two-dimensional RMS is √2
-  times as large.
+  standard deviation σ of `beam_sigma` on the aperture plane. A centred circle of radius R
+  intercepts $1 - \exp(-R^2 / 2 σ^2)$. Every σ is a standard deviation *per axis*; the
+  two-dimensional RMS is √2 times as large.
 - `intercept_disks` is Malan's model, (3.2)-(3.3): the beam is a disk of uniform irradiance, and the
-  aperture
-  is the same disk about the aim.
+  aperture is the same disk about the aim.
 
 Use the Gaussian model: a ray trace (`examples/malan_intercept.py`) agrees with it to 0.7 percentage
 points. For the aperture in (3.2) as printed, an error of 1 mrad costs 0.4 points according to the

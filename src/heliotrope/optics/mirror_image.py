@@ -75,7 +75,7 @@ class Beam:
         centre: npt.ArrayLike = (0.0, 0.0),
         power: float | None = None,
     ) -> "Beam":
-        """Return the beam from a picture taken from the front of the target, at normal view.
+        """Return the beam from a picture of the target taken head-on.
 
         Parameters
         ----------
@@ -444,7 +444,9 @@ def _mirror_axes(
 def _spread(
     target: Target, sun: FloatArray, normal: FloatArray, ray: FloatArray, distance: float
 ) -> tuple[FloatArray, float]:
-    """Return metres on the plane per rad off the ray (2, 2), and the cosine of incidence.
+    """Return the displacement on the plane per angle off the ray, m/rad, (2, 2).
+
+    Also return the cosine of incidence.
 
     The columns are for deviations in the plane of incidence and across it. A deviation e of
     the ray moves its end by d (e − r (e·N) / (r·N)), N being the target's normal.

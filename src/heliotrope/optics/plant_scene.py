@@ -195,7 +195,7 @@ def _numbers(group: Heliostats) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class _Parts:
-    """Facets of some mirrors: centre, tilt, half size, curvature 1 / 2f and variance of slope."""
+    """Facets of some mirrors: centre, tilt, half size, curvature 1 / 2f and slope variance."""
 
     center: FloatArray
     tilt: FloatArray

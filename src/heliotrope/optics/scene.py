@@ -211,7 +211,7 @@ class Mirrors:
     def with_facets(
         self, facets: FacetTable, kind: npt.NDArray[np.int64] | None = None
     ) -> "Mirrors":
-        """Return the mirrors with facets; ``kind`` may be left out if K is 1 or H.
+        """Return the mirrors with given facets; ``kind`` may be omitted if K is 1 or H.
 
         Raises
         ------

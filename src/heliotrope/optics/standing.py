@@ -192,6 +192,6 @@ def hottest(beams: Beams, center: FloatArray, around: float, limit: float = 10.0
 
 
 def _suns(beams: Beams, points: FloatArray) -> FloatArray:
-    """Return the light of all beams at points (P, 3), in suns, (P,)."""
+    """Return the irradiance from all beams at points (P, 3), in suns, (P,)."""
     parts = np.array_split(points, 1 + len(points) * len(beams) // _PAIRS)
     return np.concatenate([crossing(beams, part, dni=1.0).irradiance for part in parts])

@@ -200,7 +200,7 @@ class SunShape:
         return _fitted(self, count, round(float(np.clip(blur, *_BLURS)), 4))
 
     def spectrum(self, frequency: npt.ArrayLike) -> FloatArray:
-        """Return the Fourier transform of the image, 1 at 0, at angular frequencies, 1/rad."""
+        """Return the Fourier transform of the image at angular frequencies, 1/rad; it is 1 at 0."""
         from scipy.special import j0
 
         theta, share = self._nodes

@@ -71,7 +71,7 @@ class Plate:
 
     @cached_property
     def corners(self) -> FloatArray:
-        """Lower left, lower right, upper right, upper left, ENU m, (4, 3)."""
+        """Lower left, lower right, upper right and upper left corners, ENU m, (4, 3)."""
         across, along = 0.5 * self.width * self.right, 0.5 * self.height * self.up
         signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
         return np.stack([self.center + a * across + b * along for a, b in signs])

@@ -277,7 +277,7 @@ class PlantAssembly:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator["PlantAssembly"]:
-        """Run the plant, its operations and everything beside them for the duration of a block."""
+        """Run the plant, its operations and all accompanying tasks for the duration of a block."""
         cameras, sensors = self.ports.cameras, self.ports.sensors
         if cameras is not None:
             cameras.start(self.logbook.take_alarm)
@@ -414,7 +414,7 @@ class PlantAssembly:
 
 
 class _WhereAwake:
-    """A schedule that leaves out targets whose camera is silent."""
+    """A schedule that omits targets whose camera is silent."""
 
     def __init__(self, schedule: Scheduling, cameras: Cameras) -> None:
         self._schedule, self._cameras = schedule, cameras

@@ -83,7 +83,7 @@ class Retry:
 
 @dataclass(frozen=True)
 class _Failed:
-    """Failures of one subject: their number, the last reason and time, and the next attempt."""
+    """Failures of one subject: their number, the last reason, its time, and the next attempt."""
 
     count: int
     reason: str

@@ -1,7 +1,7 @@
 """The plant controller: the central controller of a field of clusters.
 
 It knows the state of every heliostat and the age of that information, holds the single command
-authority, accepts operator commands, sends them to the clusters and follows them to completion,
+authority, accepts operator commands, sends them to the clusters and tracks them to completion,
 renews each cluster's lease every second, evaluates the safety table, and confirms that emergency
 orders are carried out.
 
@@ -513,12 +513,12 @@ class PlantController:
         return self.clock.monotonic()
 
     def sun_vector(self, ahead: float = 0.0) -> FloatArray:
-        """Return the unit vector to the sun now, or a number of seconds ahead, ENU, (3,)."""
+        """Return the unit vector to the sun, ENU, (3,), now or some seconds from now."""
         return fast_vector(self.clock.utc().timestamp() + ahead, self.design.site)
 
     @property
     def standby_unknown(self) -> npt.NDArray[np.bool_]:
-        """A mask of the heliostats whose standby point is unknown, (N,); see `Points.unknown`."""
+        """Mask of the heliostats whose standby point is unknown, (N,); see `Points.unknown`."""
         return self._proofs.points.unknown("STANDBY")
 
     @property
@@ -751,7 +751,7 @@ class PlantController:
     def default_aims(
         self, heliostats: Sequence[str] = (), points: npt.ArrayLike | None = None
     ) -> dict[str, FloatArray]:
-        """Return an aim per heliostat (() for all), to pass to `aim`; see `aims.default_aims`."""
+        """Return one aim per heliostat (() for all), for `aim`; see `aims.default_aims`."""
         names = tuple(heliostats) or self.field.names
         rows = np.array([self.field.place(name) for name in names], dtype=np.intp)
         vertices = self.beams.armature.origin_1[rows]

@@ -1,4 +1,4 @@
-"""Every kind of refusal by the plant, as data: when, text and remedy.
+"""All kinds of refusal by the plant, as data: circumstances, text and remedy.
 
 `docs/reference/alarms.md` lists them. The code that refuses fills in the text:
 ``ROLE_TOO_LOW.error(what="TRACK", ...)``.

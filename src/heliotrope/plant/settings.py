@@ -1,4 +1,4 @@
-"""Settings of a plant: its times and limits, and the heliostats of each cluster."""
+"""Settings of a plant: times and limits, and the heliostats of each cluster."""
 
 import math
 from collections import deque

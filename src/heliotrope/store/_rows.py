@@ -1,4 +1,4 @@
-"""Conversion of records to table rows, and back.
+"""Converts records to table rows, and back.
 
 Fields and columns are matched by name, and the column types convert the values (see `tables`). Two
 kinds of record have their own functions because one record spans many rows: sightings, and the
@@ -38,7 +38,7 @@ def insert(connection: Connection, table: Table, rows: Sequence[Row]) -> int:
 
 @cache
 def _insert(dialect: str, table: Table) -> Executable:
-    """Return the insert statement, cached because events arrive in thousands."""
+    """Return the insert statement, which is cached because events arrive in thousands."""
     kind = postgresql if dialect == "postgresql" else sqlite
     statement: Executable = kind.insert(table).on_conflict_do_nothing()
     return statement

@@ -386,7 +386,7 @@ def _copy_file(source: Path, target: Path) -> None:
 
 @contextmanager
 def _changing(copy: Database) -> Iterator[Connection]:
-    """Yield a connection to change a copy in one transaction."""
+    """Yield a connection with which to change a copy in one transaction."""
     try:
         with copy.connect() as connection, connection.begin():
             yield connection
@@ -452,7 +452,7 @@ def _parts(connection: Connection, table: Any) -> Iterator[list[dict[str, Any]]]
 
 
 def _copy_telemetry(source: Path, target: Path) -> None:
-    """Copy an archive whose parts may become Parquet files in the meantime."""
+    """Copy an archive, whose parts may become Parquet files in the meantime."""
     target.mkdir(mode=0o700)
     for _ in range(2):
         for path in sorted(source.glob("????-??-??/*.*")):

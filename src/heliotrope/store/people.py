@@ -184,8 +184,8 @@ _ALIKE = str.maketrans(
 class People:
     """Accounts, sessions and tokens in a database.
 
-    All tables are small: a read takes less than a millisecond, a write one commit. Any thread may
-    call any method.
+    All tables are small, so a read takes less than a millisecond, and a write takes one commit. Any
+    thread may call any method.
 
     Parameters
     ----------
@@ -507,7 +507,7 @@ def _likeness(name: str) -> str:
 
 
 def _valid_token(row: RowMapping, now: float) -> ApiToken | None:
-    """Return the token of a row of `_TOKENS`; None if it is not valid."""
+    """Return the token in a row of `_TOKENS`; None if it is not valid."""
     # Earlier programs issued tokens that last for years, or forever.
     ends = row["created"] + LONGEST[row["role"]]
     if row["disabled"] or now >= min(ends, row["expires"] if row["expires"] is not None else ends):
@@ -530,7 +530,7 @@ def _accounts() -> Select[Any]:
 
 
 def _with_state(accounts: FromClause) -> FromClause:
-    """Join the columns that `_STATE` needs to the accounts."""
+    """Join to the accounts the columns that `_STATE` needs."""
     factor = (_FACTOR.c.name == _ACCOUNT.c.name) & _FACTOR.c.confirmed
     return accounts.outerjoin(_DUE, _DUE.c.name == _ACCOUNT.c.name).outerjoin(_FACTOR, factor)
 

@@ -416,7 +416,7 @@ class PlantFigures:
 
 @dataclass(frozen=True)
 class AuditEntry:
-    """One accepted command, like `plant.orders.audit.Record`; times are ISO 8601."""
+    """One accepted command, as in `plant.orders.audit.Record`; times are in ISO 8601."""
 
     identity: str
     who: str

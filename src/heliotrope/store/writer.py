@@ -287,7 +287,7 @@ class Writer:
             self.refused, self.refused_count = text, self.refused_count + 1
 
     def _fail(self, entries: list[_Entry], error: Exception) -> None:
-        """Notify waiting callers, whose jobs are dropped; kept jobs stay queued in order."""
+        """Notify waiting callers that their jobs are dropped; kept jobs stay queued, in order."""
         why = str(error) if isinstance(error, StoreError) else cause(error)
         self.problem = f"store {self._database.name}: cannot be written ({why}); check the disk"
         with self._news:

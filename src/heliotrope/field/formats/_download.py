@@ -37,7 +37,10 @@ class NotFoundError(FetchError):
 
 
 class StoppedError(FetchError):
-    """Another download failed or the user interrupted; completed parts are kept."""
+    """The download stopped because another one failed or the user interrupted it.
+
+    Completed parts are kept.
+    """
 
 
 class _LaterError(Exception):

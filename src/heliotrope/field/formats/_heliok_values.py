@@ -1,4 +1,4 @@
-"""Numbers with units in the attributes of a HelioK document."""
+"""Reads numbers with units from the attributes of a HelioK document."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Groups in a plant file: from tables to mechanisms and drive settings, and back without loss."""
+"""Converts groups between plant-file tables and mechanisms with drive settings, without loss."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -128,7 +128,7 @@ class _Reader:
         return column
 
     def columns(self, start: str) -> tuple[str, ...]:
-        """Return the columns whose names begin with ``start``, with numbers of this group."""
+        """Return the columns whose names begin with ``start`` and that this group fills."""
         names = (name for name in self.table.numbers if name.startswith(start))
         return tuple(name for name in names if self.column(name) is not None)
 
@@ -139,7 +139,7 @@ class _Reader:
         return None if value is None else np.asarray(value, dtype=np.float64)
 
     def array(self, key: str, value: Any) -> FloatArray:
-        """Return an array of numbers (N, …); columns ``key.i.j`` replace single elements."""
+        """Return an array of numbers, (N, …); columns ``key.i.j`` replace individual elements."""
         base = np.asarray(value, dtype=np.float64)
         full = np.array(np.broadcast_to(base, (len(self.rows), *base.shape)))
         for index in np.ndindex(base.shape):
@@ -421,7 +421,7 @@ class _Reader:
         defocus: FloatArray,
         joints: Sequence[str],
     ) -> None:
-        """Check that the largest rotation of a DEFOCUS, with its spread, ends in time."""
+        """Check that the largest rotation of a DEFOCUS, including its spread, ends in time."""
         low, high, rate, ramp, _ = np.stack(axes, axis=1).transpose(2, 0, 1).astype(np.float64)
         steps = np.abs(defocus / drives.radians_per_count(0.5 * (low + high)))
         time = steps / rate + rate / ramp
@@ -522,7 +522,7 @@ def group_document(
 def _machine_document(
     heliostats: Heliostats, first: Callable[[str, npt.NDArray[Any]], Any]
 ) -> dict[str, Any]:
-    """Return the table of the machines; ``first`` puts numbers that differ into columns."""
+    """Return the machine table; ``first`` puts numbers that differ into columns."""
     machines, m = heliostats.machines, heliostats.mechanism
     joints = [m.joints[d] for d in m.driven]
     axes = {}

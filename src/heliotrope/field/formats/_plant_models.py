@@ -73,7 +73,7 @@ class PlantSiteTable(StrictTable):
 
 
 class MarkTable(StrictTable):
-    """A mark on a target: L, T, square, disc, tag or taught picture."""
+    """A mark on a target: L, T, square, disc, tag or reference picture."""
 
     name: str = Field(min_length=1)
     kind: Literal["corner", "tee", "square", "disc", "tag", "picture"]
@@ -136,7 +136,7 @@ class TowerTable(StrictTable):
 
 
 class CameraTable(StrictTable):
-    """``[[cameras]]``: a pinhole with distortion, in the convention of OpenCV."""
+    """``[[cameras]]``: a pinhole camera with distortion, in OpenCV's convention."""
 
     name: str = Field(min_length=1)
     size_px: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=2)]
@@ -287,7 +287,7 @@ class AxisTable(StrictTable):
 
 
 class SteppingTable(StrictTable):
-    """``[groups.NAME.machine.stepping]``: the motors' drivers."""
+    """``[groups.NAME.machine.stepping]``: the drivers of the stepper motors."""
 
     microsteps: Annotated[
         list[Annotated[int, Field(ge=1, le=256)]], Field(min_length=2, max_length=2)
@@ -299,7 +299,7 @@ class SteppingTable(StrictTable):
 
 
 class MachineTable(StrictTable):
-    """``[groups.NAME.machine]``: what local controllers store besides the calibration."""
+    """``[groups.NAME.machine]``: settings that local controllers store beside the calibration."""
 
     axes: dict[str, AxisTable] = Field(description="For each driven joint.")
     stow_steps: Annotated[list[Steps], Field(min_length=2, max_length=2)] | None = Field(

@@ -21,7 +21,7 @@ _SIZES = ("width_m", "height_m", "radius_m")
 
 
 def surface_values(table: Any) -> dict[str, str]:
-    """Return the values of a target or a receiver that can be set, by name."""
+    """Return the settable values of a target or a receiver, by name."""
     facing, tilt = _angles(table)
     values = {
         RENAMED: str(table["name"]),
@@ -34,7 +34,7 @@ def surface_values(table: Any) -> dict[str, str]:
 
 
 def set_surface(table: Any, changes: Mapping[str, str]) -> tuple[str, ...]:
-    """Set values of a target or a receiver; return warnings.
+    """Set some values of a target or a receiver; return warnings.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def _corners(table: Any) -> None:
 
 
 def _axes(facing: float, tilt: float) -> FloatArray:
-    """Return the matrix whose columns are right (as seen from the front), up and normal, ENU."""
+    """Return the matrix with columns right (as seen from the front), up and normal, in ENU."""
     azimuth, elevation = np.radians(facing), np.radians(tilt)
     normal = np.array(
         [
@@ -133,7 +133,7 @@ def _center(table: Any) -> FloatArray:
 
 
 def _points(table: Any) -> Iterator[tuple[str, FloatArray]]:
-    """Yield the single points of a surface beside its centre, by name."""
+    """Yield the individual points of a surface, apart from its centre, by name."""
     for k, corner in enumerate(table.get("corners_m", ())):
         yield f"corners_m.{k}", np.array([float(x) for x in corner])
     for name, point in table.get("markers_m", {}).items():

@@ -1,4 +1,4 @@
-"""Mirror surfaces measured and published by PAINT (HDF5): points and normals become slopes.
+"""Reads mirror surfaces that PAINT publishes (HDF5), and converts them to slopes.
 
 A file contains the groups ``facet1``, ``facet2``, … of one heliostat, in the order of its
 properties, each with the datasets ``surface_points``, m, and ``surface_normals``, (K, 3), in the

@@ -10,7 +10,7 @@ from heliotrope.mechanism.kinds import NORTH, UP
 def mirror_frame(normal: npt.ArrayLike) -> FloatArray:
     """Return the mirror's axes (x right, y up, z along the normal) in the chain's last frame.
 
-    Facets are given in these axes. At zero joint angles y is as close to up as the mirror
+    Facets are specified in these axes. At zero joint angles y is as close to up as the mirror
     allows (to north for a mirror that lies face up), and x is to the right as seen from
     the front.
 

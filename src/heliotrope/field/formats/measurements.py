@@ -1,7 +1,7 @@
 """Camera-target measurements: positions of heliostat beams on a target.
 
 The measurements are read from ``measurements.csv`` or from PAINT's calibration properties. A record
-that cannot be used is left out and named.
+that cannot be used is left out and reported.
 """
 
 from dataclasses import dataclass

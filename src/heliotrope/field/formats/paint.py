@@ -178,7 +178,7 @@ def _facets(root: JsonNode) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Tower:
-    """The tower's file: reference point, targets and receivers.
+    """The contents of the tower file: reference point, targets and receivers.
 
     Attributes
     ----------
@@ -228,7 +228,7 @@ def read_tower(path: str | Path) -> Tower:
 
 
 def _corners(node: JsonNode, points: dict[str, FloatArray], prefix: str = "") -> FloatArray:
-    """Return the corners from the upper left, as seen from the front."""
+    """Return the corners of a surface, starting at the upper left, as seen from the front."""
     order = ("upper_left", "upper_right", "lower_right", "lower_left")
     for corner in order:
         if prefix + corner not in points:
@@ -410,7 +410,7 @@ class CalibrationProperties:
 
 
 def read_calibration_properties(path: str | Path) -> CalibrationProperties:
-    """Return one calibration measurement; both published key styles are supported."""
+    """Return one calibration measurement; both published styles of keys are supported."""
     root = read_json(path, "PAINT calibration properties")
     motors = root["motor_position"]
     spots = {name: node.geodetic() for name, node in root["focal_spot"].items() if node.value}

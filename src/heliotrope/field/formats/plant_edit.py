@@ -71,7 +71,7 @@ class Version:
 
 
 def values(path: str | Path, who: str) -> dict[str, str]:
-    """Return the values of a heliostat, a target or a receiver that can be set, by name.
+    """Return the settable values of a heliostat, a target or a receiver, by name.
 
     Raises
     ------
@@ -166,7 +166,7 @@ def versions(path: str | Path) -> list[Version]:
 
 
 def restore(path: str | Path, version: str, *, note: str = "", now: datetime | None = None) -> str:
-    """Restore a stored version; return the version name of the replaced file.
+    """Restore a stored version; return the name under which the replaced file was stored.
 
     Raises
     ------

@@ -4,8 +4,8 @@ A heliostat has acknowledged the order when its local controller says so, or whe
 after the order implies it. Whether a heliostat counts as done depends on its state *and* on its
 axes. Its beam is off the receiver when the axes are within `NEAR` of the defocus goals, whatever
 the state is called, and when the beam, computed from step counts and the believed mechanism, is on
-no receiver, because a heliostat at standby may turn its beam onto one. A heliostat with unknown
-step counts is never done; the report says where its beam was last.
+no receiver, because a heliostat at standby may turn its beam onto a receiver. A heliostat with
+unknown step counts is never done; the report says where its beam was last.
 """
 
 from collections.abc import Mapping
@@ -75,7 +75,7 @@ class EmergencyOrder:
         return self._proof
 
     def take_flux(self, share: float, at: float) -> None:
-        """Accept a flux reading, as a fraction of the nominal flux."""
+        """Accept a flux reading, which is a fraction of the nominal flux."""
         self._proof = self.proof.with_flux(share, at)
 
     def is_acknowledged(self, heliostat: str) -> bool:

@@ -209,7 +209,7 @@ class Sentinel(Part):
     # -- orders ----------------------------------------------------------------------------
 
     def _begin_again(self, act: Act) -> None:
-        """Order the act that the table demands, or continue the previous program's emergency."""
+        """Order the action that the table requires, or continue an earlier program's emergency."""
         before, self._recalled = self._recalled, Standing()
         if before.act:
             self._begin(max(act, Act[before.act]), _AGAIN, before.continued, before.giver)
@@ -414,7 +414,7 @@ class Sentinel(Part):
         order.take_stage(heliostats, stage, now)
 
     def on_rows(self, cluster: str, now: float) -> None:
-        """Update the proof of the order from a cluster's new status."""
+        """Update, from a cluster's new status, how far the order has been carried out."""
         order, names = self._proving, self._field.members[cluster]
         if not self.on:
             names = tuple(name for name in names if name in self._unproven)

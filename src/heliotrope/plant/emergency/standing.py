@@ -1,4 +1,4 @@
-"""The active emergency, as the store preserves it across a restart of the plant program."""
+"""The record of the active emergency that the store preserves across a restart of the plant."""
 
 import json
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ class EmergencyRecord(Protocol):
         ...
 
     def keep_emergency(self, document: str) -> None:
-        """Replace the document; an empty one means that no emergency is active.
+        """Replace the document; an empty document means that no emergency is active.
 
         Raises
         ------

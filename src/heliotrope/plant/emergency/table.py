@@ -140,7 +140,7 @@ class PlantReadings:
 
 
 class TableWatch:
-    """Evaluation of the safety-table rows for which the plant is responsible.
+    """Evaluates the safety-table rows for which the plant is responsible.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ class TableWatch:
         return news
 
     def recall(self, rows: Iterable[tuple[str, str]]) -> None:
-        """Restore rows as tripped before a restart, each with its subject."""
+        """Restore the rows that were tripped before a restart, each with its subject."""
         self._state = recalled(self._state, rows)
 
     def standing(self) -> tuple[tuple[str, str], ...]:

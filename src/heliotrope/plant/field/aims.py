@@ -172,8 +172,7 @@ class BeamCheck:
     def _stop(self, row: int) -> None:
         """Use the drive limits as stops, as the local controller does for its pose.
 
-        Without stops, the pose nearest to the present one may differ from the pose that the
-        heliostat takes.
+        Without stops, the computed pose may differ from the pose that the heliostat takes.
         """
         machine, table = self.machines.get(self.names[row]), self.drives.table[row]
         for i, axis in enumerate(() if machine is None else machine.axes):
@@ -569,7 +568,7 @@ def _rows_of(mirrors: MirrorOptics, rows: npt.NDArray[np.intp] | list[int]) -> M
 
 
 def _disc(eye: FloatArray, aim: FloatArray, radius: float, apart: float) -> FloatArray:
-    """Return points (P, 3) of the disc at the aim that a cone of half angle ``radius`` covers."""
+    """Return points (P, 3) on the disc at the aim that a cone of half angle ``radius`` covers."""
     ray = aim - eye
     distance = float(np.linalg.norm(ray))
     right = np.cross(ray, (0.0, 0.0, 1.0)) if ray[:2].any() else np.array([1.0, 0.0, 0.0])

@@ -10,8 +10,8 @@ name and renamed, so that either the old or the new file always exists.
 A local controller may refuse a point, or never receive it. The previous points are therefore kept
 until the new point is acknowledged, so that a restarted program knows where a beam may still be.
 
-What visits hold (`HELD`) is stored with the points, also on disk before it is taken; a restarted
-program releases it (`giving_back`).
+What visits hold (`HELD`), such as locks, is stored with the points, also before a visit takes it; a
+restarted program releases it (`giving_back`).
 """
 
 import json
@@ -345,7 +345,7 @@ class Points:
 
 
 def differ(a: FloatArray, b: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return a mask of the points (K, 3) that differ, (K,); NaN equals NaN."""
+    """Return a mask of where two sets of points (K, 3) differ, (K,); NaN equals NaN."""
     return np.asarray(~np.all((a == b) | (np.isnan(a) & np.isnan(b)), axis=-1))
 
 
@@ -383,7 +383,7 @@ def rest_on(standbys: FloatArray, point: tuple[float, float, float] | None) -> N
 
 
 def points_of(kind: str, points: Mapping[str, npt.ArrayLike]) -> FloatArray:
-    """Return points by name as an array, ENU, m, (K, 3), in their order.
+    """Return points that are keyed by name as an array, ENU, m, (K, 3), in the same order.
 
     Raises
     ------

@@ -90,7 +90,7 @@ class Beliefs:
             subscriber(record)
 
     def subscribe_drift(self, subscriber: Subscriber) -> None:
-        """Call a function with each calibration whose covariance growth changes from now on."""
+        """From now on, call a function with each calibration whose covariance growth changes."""
         self._drifting.append(subscriber)
 
     def number_with(self, numbering: Numbering) -> None:
@@ -107,7 +107,7 @@ class Beliefs:
     def present(self, heliostat: str) -> Mechanism:
         """Return the present believed mechanism, batch shape (1,).
 
-        Before the first calibration it is the mechanism of the plant file, with its parameters.
+        Before the first calibration, this is the mechanism in the plant file, with its parameters.
         """
         record = self._records.get(heliostat)
         if record is not None:
@@ -125,7 +125,7 @@ class Beliefs:
         return self._growth[heliostat]
 
     def hyper(self, heliostat: str) -> Hyperparameters | None:
-        """Return the hyperparameters of the heliostat's group; None while the defaults apply."""
+        """Return the hyperparameters of a heliostat's group; None while the defaults apply."""
         return self._hyper.get(heliostat)
 
     def known(self, heliostat: str) -> KnownSightings | None:
@@ -133,7 +133,7 @@ class Beliefs:
         return self._known.get(heliostat)
 
     def count(self, heliostat: str) -> int:
-        """Return the number of known sightings of a heliostat, photographed and airborne."""
+        """Return the number of known sightings of a heliostat, from photographs and flights."""
         known = self._known.get(heliostat)
         return (0 if known is None else len(known)) + self.flights.count(heliostat)
 
@@ -168,9 +168,10 @@ class Beliefs:
         return self._known[heliostat]
 
     def take(self, record: HeliostatCalibration) -> HeliostatCalibration:
-        """Make a calibration the current one, pass it to all subscribers, and return it.
+        """Make a calibration the heliostat's current calibration, and pass it to all subscribers.
 
-        From now on its covariance grows with the drift of its group.
+        From now on the covariance of the calibration grows with the drift of the heliostat's group.
+        The calibration is returned.
         """
         record = record.growing(self.growth(record.heliostat))
         self._records[record.heliostat] = record

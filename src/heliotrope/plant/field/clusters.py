@@ -1,4 +1,4 @@
-"""The plant's ends of the cluster links: messages sent, leases, queries and replies."""
+"""The plant's ends of the links to clusters: messages sent, leases, queries and replies."""
 
 import asyncio
 import math

@@ -34,7 +34,7 @@ _POLL = 0.5
 
 
 class DriveChecks(Part):
-    """Evidence about the drives beyond their step counts.
+    """Collects evidence about the drives beyond their step counts.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class DriveChecks(Part):
         self._silent: set[str] = set()
 
     async def checked(self, heliostats: Iterable[str], timeout: float) -> None:
-        """Wait until none of the heliostats is due any longer, for at most ``timeout`` s."""
+        """Wait, for at most ``timeout`` s, until none of the heliostats is due any longer."""
         until = self._clock.monotonic() + timeout
         while self.due.intersection(heliostats) and self._clock.monotonic() < until:
             await sleep_until(self._clock, self._clock.monotonic() + _POLL)

@@ -18,7 +18,7 @@ _NAMED = 5
 
 
 class Firmware(Part):
-    """The comparison of firmware versions.
+    """Compares the boards' firmware versions with the expected version.
 
     Parameters
     ----------

@@ -93,7 +93,7 @@ class Flights:
         return sum(map(len, self._rows.get(heliostat, ())))
 
     def adding(self, new: TakenFlight) -> "Flights":
-        """Return the flights with a new one added; beyond `MOST` the oldest are left out."""
+        """Return the flights with a new flight added, but only the last `MOST` flights."""
         taken = (*self._taken, new)
         oldest = len(taken) - MOST if len(taken) > MOST else 0
         first, size = self._edges[oldest], len(new.flight.shared)
@@ -124,7 +124,7 @@ class Flights:
         self._set((*self._taken[:-1], last))
 
     def number(self, flight: str, identities: Identities) -> None:
-        """Store the numbers that the store assigned to the sightings of a flight, (M,)."""
+        """Remember the numbers that the store assigned to the sightings of a flight, (M,)."""
         self._set(
             tuple(
                 replace(flown, identities=identities) if flown.flight.name == flight else flown

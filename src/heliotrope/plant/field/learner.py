@@ -1,4 +1,4 @@
-"""Learning for heliostat groups, in a process separate from the plant."""
+"""Learns heliostat groups in a process separate from the plant."""
 
 import asyncio
 import os

@@ -145,9 +145,9 @@ class Ledger(Part):
             column.acknowledged[mine], column.accepted[mine] = now, accepted_at
 
     def refused(self, name: str, heliostats: Sequence[str], now: float) -> None:
-        """Note that heliostats refused a command; they may not be where they were last reported.
+        """Note that heliostats refused a command, so they may not be where they last reported.
 
-        A refusal that the reported state explains, such as that of APPROACH in TRACKING, is
+        A refusal that the reported state explains, such as a refusal of APPROACH in TRACKING, is
         ignored.
         """
         state = self._field.rows["state"]

@@ -1,4 +1,4 @@
-"""Detects another plant with the same keys: clusters report which run they belong to."""
+"""Detects another plant with the same keys, because clusters report which run they obey."""
 
 from collections.abc import Callable, Iterable
 
@@ -8,7 +8,7 @@ from heliotrope.safety import Alarm, alarms
 
 
 class SecondPlant(Part):
-    """Clusters that refuse this plant because they belong to another one.
+    """Detects clusters that refuse this plant because they belong to another plant.
 
     Parameters
     ----------

@@ -147,7 +147,7 @@ CALLS: dict[str, Call] = {}
 
 
 def _call(request: str = "", group: str = "", role: Role = VIEWER, **more: Any) -> Callable[[F], F]:
-    """Add a function to the table, under its name; see `Call`."""
+    """Return a decorator that adds a function to the table under its name; see `Call`."""
 
     def add(function: F) -> F:
         hints = get_type_hints(function)
@@ -410,7 +410,7 @@ def seize_authority(desk: Desk, who: Person, order: orders.GivenReason) -> Later
 
 @_call("PUT authority", "authority", OPERATOR, unlimited=True)
 def keep_authority(desk: Desk, who: Person) -> AuthorityState:
-    """Renew the command authority, every few seconds while its holder is present."""
+    """Renew the command authority; to be called every few seconds while its holder is present."""
     return desk.keep(who)
 
 
@@ -425,13 +425,13 @@ def release_authority(desk: Desk, who: Person) -> AuthorityState:
 
 @_call("POST stow", "commands", OPERATOR, urgent=True)
 def stow(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketState:
-    """Send heliostats to stow; needs no command authority."""
+    """Send heliostats to stow; this needs no command authority."""
     return desk.tickets.put(desk.operations.stow(who, order.heliostats))
 
 
 @_call("POST defocus", "commands", OPERATOR, urgent=True)
 def defocus(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketState:
-    """Move beams off the receiver; needs no command authority."""
+    """Move beams off the receiver; this needs no command authority."""
     return desk.tickets.put(desk.operations.defocus(who, order.heliostats))
 
 
@@ -439,7 +439,7 @@ def defocus(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketStat
 def command(desk: Desk, who: Person, order: orders.CommandOrder) -> Later[TicketState]:
     """Give a bus command.
 
-    APPROACH, TRACK, IDLE, REFOCUS, LOCK, UNLOCK, SEARCH, JOG, ZERO and more.
+    The commands are APPROACH, TRACK, IDLE, REFOCUS, LOCK, UNLOCK, SEARCH, JOG, ZERO and more.
     """
     here, token = desk.operations, desk.token_of(who)
     ticket: Ticket

@@ -1,4 +1,4 @@
-"""What the calls share in the plant's process: operations, tickets, and who is present.
+"""Everything that the calls share in the plant's process: operations, tickets, who is present.
 
 The command authority is renewed for a holder whose page or program has been active recently. It
 expires by the plant's time, which may run faster than real time.

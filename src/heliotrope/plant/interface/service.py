@@ -293,7 +293,7 @@ class PlantInterface:
 
 
 class _Turns:
-    """Runs one call at a time in the plant's event loop, for a fraction of its time."""
+    """Runs one call at a time in the plant's event loop, for a limited fraction of the time."""
 
     def __init__(self, interface: PlantInterface, share: float) -> None:
         self._interface, self._rest = interface, 1.0 / share - 1.0

@@ -108,7 +108,7 @@ class Feed:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread; a thread that hangs in a driver is left behind."""
+        """End the thread; a thread that hangs in a driver is abandoned."""
         self._source.stop.set()
         self._source.wanted.set()
         if self._thread.is_alive():
@@ -249,7 +249,7 @@ class RealCameras:
         return eye.feed.newest
 
     def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
-        """Evaluate later photographs with a camera and target marks; see `plant.ports.Cameras`."""
+        """Set the camera and target marks for later photographs; see `plant.ports.Cameras`."""
         old = self._eye(target.name)
         targets = tuple(target if t.name == target.name else t for t in old.targets)
         new = _Eye(camera, targets, old.feed)
@@ -267,7 +267,7 @@ class RealCameras:
         return target in self._eyes
 
     def awake(self, target: str) -> bool:
-        """Return whether a target has a camera that is not silent, or delivers frames again."""
+        """Return whether a target has a camera that is not silent, or has recovered."""
         eye = self._eyes.get(target)
         if eye is None:
             return False

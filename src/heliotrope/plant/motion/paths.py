@@ -72,7 +72,7 @@ class Paths:
                 self._low[row, i], self._high[row, i] = axis.low, axis.high
 
     def points(self, rows: Rows, standbys: FloatArray) -> tuple[FloatArray, Rows]:
-        """Return the points of the paths to standby points (K, 3), ENU, m.
+        """Return the points along the paths to standby points (K, 3), ENU, m.
 
         Returns
         -------
@@ -203,7 +203,7 @@ def _time(steps: FloatArray, rate: FloatArray, ramp: FloatArray) -> FloatArray:
 
 
 def _bends(steps: FloatArray, rate: FloatArray, ramp: FloatArray) -> FloatArray:
-    """Return instants (M, K, 1), last first, between which motions are nearly straight, s."""
+    """Return instants, s, (M, K, 1), last first, between which motions are nearly straight."""
     last = _time(steps, rate, ramp)
     part = np.minimum(ramp, 0.5 * last) * (np.arange(_PARTS + 1) / _PARTS)[:, None, None]
     times = np.concatenate([part[1:], last - part])

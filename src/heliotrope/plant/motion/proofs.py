@@ -48,7 +48,7 @@ _TO_STANDBY = (
 
 
 class BeamError(RefusedError):
-    """The refusal of a command that would send beams where they are not allowed.
+    """A command is refused because it would send beams where they are not allowed.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class BeamError(RefusedError):
 
 
 class PathProofs:
-    """Proofs that commands bring no beam into a keep-out volume.
+    """Proves that commands bring no beam into a keep-out volume.
 
     Parameters
     ----------
@@ -313,7 +313,7 @@ class PathProofs:
             self._check.replace(row, *present)
 
     def _misled(self, rows: Rows, point: FloatArray, tables: Tables) -> dict[str, str]:
-        """Return the reason why the path of one heliostat to a point (1, 3) is blocked.
+        """Return why the path of one heliostat to a point (1, 3) is blocked; None if it is clear.
 
         The heliostat is moved by the parameters of the check, and its beam is computed from
         ``tables``.

@@ -63,7 +63,7 @@ class StrayBeams:
         return bool(self._check.solids)
 
     def on_receiver(self, rows: npt.NDArray[np.intp]) -> Mask:
-        """Return a mask of heliostats (K,) with beams on a receiver, by their last counts."""
+        """Return a mask of the heliostats whose last counts put the beam on a receiver, (K,)."""
         drives = Drive(self._check.drives.table[rows])
         return self._check.lights(rows, drives.angles(self._field.counts(rows)), self._sun(0.0))
 

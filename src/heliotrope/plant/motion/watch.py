@@ -51,7 +51,7 @@ class BeamWatch:
 
     @property
     def watched(self) -> frozenset[str]:
-        """Names of the readings, for keep-out volumes and for receivers, if there are any."""
+        """Names of the readings: one each for keep-out volumes and receivers, if there are any."""
         surfaces = {"keep_out_predicted": self._check.volumes, "beam_unsent": self._check.solids}
         return frozenset(name for name, places in surfaces.items() if places)
 

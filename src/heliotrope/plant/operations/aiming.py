@@ -329,7 +329,7 @@ class Aiming:
         return self._plant.sentinel.table.shown(now).get(DNI_READING, math.nan)
 
     async def _failed(self, problem: str) -> None:
-        """Keep the last good aims; once they are too old, go to the safe spread."""
+        """Keep the last good aims; once these are too old, go to the safe spread."""
         if not self._problem:
             self._log.take_alarm(alarms.AIMS.raised(problem=problem))
         self._problem = problem
@@ -343,7 +343,7 @@ class Aiming:
             await self._to_safe(self._answer.safe)
 
     async def _to_safe(self, safe: FloatArray) -> None:
-        """Go to the safe spread; beams at other aims leave first, so that none overlap."""
+        """Go to the safe spread; beams at other aims leave first, so that beams never overlap."""
         on = self._on(self._plant.now()) & self._movers(self._plant.now())
         apart = ~(np.linalg.norm(self._plant.aims - safe, axis=1) < 0.05)
         rows = np.flatnonzero(on & apart)
@@ -409,7 +409,7 @@ class Aiming:
         )
 
     def _allowed(self, limit: FluxLimit, scene: Scene) -> FluxLimit:
-        """Return the limit, lowered where a measured flux was above it."""
+        """Return the limit, lowered where a measured flux was above the limit."""
         if not self._beyond:
             return limit
         factor = np.max([beyond.factor for _, beyond in self._beyond], axis=0)
@@ -426,7 +426,7 @@ class Aiming:
         return replace(scene, surfaces=(surface_of(receiver),), mirrors=mirrors, dni=dni)
 
     def _demand(self, limit: FluxLimit) -> Demand:
-        """Return the limit, and the certainty with which it must hold."""
+        """Return the limit, and the probability with which the limit must hold."""
         plant, settings = self._plant, self._settings
         clusters = np.unique(plant.field.cluster, return_inverse=True)[1]
         latitude = math.radians(plant.design.site.latitude_deg)

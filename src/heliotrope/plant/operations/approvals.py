@@ -88,7 +88,7 @@ class WaitingChange:
 
 
 class _Course:
-    """The course of a change, which its author's ticket follows."""
+    """The progress of a change, which its author's ticket tracks."""
 
     def __init__(self, change: WaitingChange) -> None:
         self.change, self.approver = change, ""
@@ -221,7 +221,7 @@ class Approvals:
     async def approve(self, person: Person, number: int) -> Ticket:
         """Approve another engineer's change and write it; return the ticket for writing it.
 
-        The author's command authority is used, or else the approver's.
+        The change is written with the author's command authority or, failing that, the approver's.
 
         Raises
         ------

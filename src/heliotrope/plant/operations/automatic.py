@@ -545,7 +545,7 @@ class AutomaticControl:
         return self._visiting()
 
     def move(self, points: Mapping[str, FloatArray]) -> Ticket:
-        """Aim tracking heliostats at other points, ENU, m, (3,); see `PlantController.aim`."""
+        """Aim tracking heliostats at new points, ENU, m, (3,); see `PlantController.aim`."""
         return self._plant.aim(AUTOMATIC, self._token, points)
 
     def rest(self, heliostats: Sequence[str]) -> Ticket:
@@ -599,7 +599,7 @@ class AutomaticControl:
                 group.create_task(self._again("prediction", look, POINT_EVERY))
 
     async def _again(self, name: str, part: Callable[[], Awaitable[None]], pause: float) -> None:
-        """Repeat a part of the work; a failure raises an alarm and ends nothing."""
+        """Repeat a part of the work; a failure raises an alarm, but does not end the repetition."""
         refused = ""
         # A cancelled visit brings its beam home, and may then end with another error.
         while not self._stopped:
@@ -715,7 +715,7 @@ class AutomaticControl:
             await self._raising.step(self._token, self._visiting, resting)
 
     def _left_alone(self) -> npt.NDArray[np.bool_]:
-        """Return a mask of the heliostats that automatic control leaves where they are, (N,)."""
+        """Return a mask of the heliostats that automatic control does not move, (N,)."""
         return self._losses.settling() | self.service.rows() | self._raising.given_up()
 
     async def _diagnose(self) -> None:

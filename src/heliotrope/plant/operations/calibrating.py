@@ -286,11 +286,11 @@ class Calibrating:
         return self._scheduler.reason
 
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> tuple[PlannedVisit, ...]:
-        """Return the coming visits of the ready heliostats, (N,)."""
+        """Return the next planned visits of the ready heliostats, (N,)."""
         return tuple(self._scheduler.plan(self._chooses(ready), limit))
 
     def _chooses(self, ready: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-        """Return a mask of the ready heliostats that the schedule may choose itself, (N,)."""
+        """Return a mask of the ready heliostats that the schedule itself may choose, (N,)."""
         return np.asarray(ready & ~self._ruled("never"))
 
     async def visit(
@@ -347,7 +347,7 @@ class Calibrating:
     async def _for_joint_visit(
         self, joint: JointVisits, target: str, ready: npt.NDArray[np.bool_]
     ) -> tuple[str, ...]:
-        """Return the heliostats of a joint visit; () if the next visit is a single one."""
+        """Return the heliostats of a joint visit; () if a single heliostat comes next."""
         if names := joint.requests.next(target, ready):
             return names
         alone = any(

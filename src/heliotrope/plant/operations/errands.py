@@ -29,7 +29,7 @@ Progress = Callable[[Sequence[str]], Mapping[str, Step]]
 
 @dataclass(frozen=True)
 class _Errand:
-    """An operation in progress: its ticket, its time limit, and what to call if it is given up."""
+    """An operation in progress: its ticket, its time limit, and a function to call on giving up."""
 
     ticket: Ticket
     progress: Progress

@@ -119,7 +119,7 @@ class FlightIntake:
         return self._conclude(taken, flights, fits, text)
 
     def take_now(self, person: Person, document: FlightDocument, text: str) -> FlightView:
-        """Import a flight within the caller's thread, as `take` does."""
+        """Import a flight as `take` does, but within the caller's thread."""
         flight = self._checked(person, document)
         taken = TakenFlight(
             flight, np.zeros(len(flight.sightings), np.int64), self._utc(), person.name
@@ -164,7 +164,7 @@ class FlightIntake:
     def _conclude(
         self, taken: TakenFlight, flights: Flights, fits: Mapping[str, JudgedFit], text: str
     ) -> FlightView:
-        """Adopt a flight that does not contradict the field; sort its heliostats."""
+        """Adopt a flight that does not contradict the field; decide what its heliostats do."""
         flight, wrong = taken.flight, [n for n, f in fits.items() if f.outcome in WRONG]
         if len(wrong) > _MOST_WRONG * len(fits):
             first = f"{wrong[0]}: {fits[wrong[0]].problem}"

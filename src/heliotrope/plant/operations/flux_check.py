@@ -71,7 +71,7 @@ class Beyond:
 
 
 def distance(view: PredictedView, measured: FloatArray, mean: float, area: float) -> float:
-    """Return how far a measured flux is from the predicted one, in standard deviations.
+    """Return how far a measured flux is from the predicted flux, in standard deviations.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ class Forgetting(Protocol):
     """Records whose old events can be removed."""
 
     def forget_events(self, before: float) -> None:
-        """Remove events before a time, and alarms that were cleared and acknowledged by then."""
+        """Remove events before a time, and alarms cleared and acknowledged by that time."""
         ...
 
 

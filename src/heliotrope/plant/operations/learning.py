@@ -186,7 +186,7 @@ class Learning:
             self._log.event("calibration", person.name, f"group {name}: {group.said}")
 
     def _judged(self, name: str, group: _Group, person: Person, found: LearntGroup) -> str:
-        """Put the result in force if it predicts photographs better; return the message."""
+        """Activate the result if it predicts photographs better; return a message about it."""
         origin = f"{found.sightings:,} photographs of {found.heliostats} heliostats"
         if not found.gain > 0.0:
             return f"{origin}: new values would not predict them better, so nothing changed"

@@ -54,7 +54,7 @@ Pixel = tuple[float, float]
 
 
 class MarkedCameras(Protocol):
-    """Cameras whose view of a target can be replaced while they work."""
+    """Cameras whose view of a target can be replaced while they are in use."""
 
     def eye(self, target: str) -> Camera:
         """Return the camera of a target, as now known."""
@@ -405,7 +405,7 @@ def _near(a: FloatArray | None, b: FloatArray | None) -> bool:
 
 
 def _with(plant: Plant, camera: Camera, target: Target) -> Plant:
-    """Return a plant with another camera, and with the marks of a target."""
+    """Return a plant with one camera replaced, and with new marks on a target."""
     here = replace(plant.target(target.name), marks=target.marks)
     targets = tuple(here if t.name == target.name else t for t in plant.targets)
     return with_camera(replace(plant, targets=targets), camera)
@@ -465,7 +465,7 @@ def _view_of(taught: Taught, frame: Frame, kept: str) -> MarksView:
 
 
 def _rectified(taught: Taught, frame: Frame, target: Target) -> Image:
-    """Return the target from the front, uint8 (H, W), as the new view shows it."""
+    """Return the target as seen from the front, rectified with the new view, uint8 (H, W)."""
     face, known = faces((target,))[0], known_points(target)
     plane = face.plane(np.array([known[p.name] for p in taught.points]))
     pixels = np.array([p.pixel for p in taught.points])

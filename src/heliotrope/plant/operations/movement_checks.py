@@ -76,7 +76,7 @@ class MovementChecks:
 
     @property
     def moved(self) -> Mask:
-        """A mask of the heliostats under diagnosis, (N,)."""
+        """Mask of the heliostats under diagnosis, (N,)."""
         moved = np.zeros(len(self._plant.field), dtype=np.bool_)
         moved[[self._plant.field.place(name) for name in self._running]] = True
         return moved

@@ -198,7 +198,7 @@ class Operations:
             await asyncio.sleep(_LOOKED)
 
     async def _compare(self) -> None:
-        """Compare the flux on the receiver with the predicted one."""
+        """Compare the flux on the receiver with the predicted flux."""
         while True:
             # The worker process may have ended, in which case another one is started.
             with contextlib.suppress(HeliotropeError):
@@ -344,7 +344,7 @@ class Operations:
         self._tell(person, text.strip(), NOTE)
 
     async def _read(self, what: str, read: Callable[[Records], T]) -> T:
-        """Return data that a thread reads from the store, including the latest records."""
+        """Return data read from the store in a thread, including the latest records."""
         if self._records is None:
             raise InputError(f"{what}: this plant keeps no records; run it with a data folder")
         await self._records.confirm()
@@ -366,7 +366,7 @@ class Operations:
         return SunView(at, self.plant.sun_vector(), float(found.azimuth), float(found.elevation))
 
     async def receiver_flux(self, name: str = "") -> PredictedView:
-        """Return the predicted flux on a receiver ("": the first); see `PredictedFlux`.
+        """Return the predicted flux on a receiver ("": the first receiver); see `PredictedFlux`.
 
         Raises
         ------
@@ -460,7 +460,7 @@ class Operations:
         return view
 
     def learn(self, person: Person, group: str = "") -> None:
-        """Learn a heliostat group ("": all) now; see `Learning.order`."""
+        """Learn a heliostat group ("": all groups) now; see `Learning.order`."""
         self.automatic.learning.order(person, group)
         self._tell(person, f"requested learning for {group or 'all groups'}")
 
@@ -652,7 +652,7 @@ class Operations:
         return ticket
 
     def aim(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
-        """Aim heliostats at points, at which they remain aimed; see `PlantController.aim`."""
+        """Aim heliostats at points; they keep these aims. See `PlantController.aim`."""
         ticket = self.plant.aim(person, token, points)
         self._aiming.by_person(ticket.heliostats, aimed=True)
         self._told(person, ticket)

@@ -1,4 +1,4 @@
-"""The flux that the field is expected to bring to its receivers.
+"""Predicts the flux that the field brings to its receivers.
 
 Every mirror is in the pose that its reported step counts yield under its present calibration, so
 heliostats that are turned away or at stow shade and block in those poses.

@@ -210,7 +210,7 @@ class Raising:
         return len(names)
 
     def release(self, heliostat: str) -> None:
-        """Allow a new command to a heliostat at once: its visit to a target has ended."""
+        """Allow a new command to a heliostat at once, because its visit to a target has ended."""
         self._busy_until[self._plant.field.place(heliostat)] = -math.inf
 
     def _clear_of_targets(
@@ -374,7 +374,7 @@ class Raising:
                 self._log.take_alarm(alarms.BEAM_BLOCKED.raised(name, reason=text))
 
     def _look_at_blocked(self) -> None:
-        """Raise alarms about beams blocked when their turn came; clear obsolete alarms."""
+        """Raise alarms about beams that were blocked in their turn; clear obsolete alarms."""
         for ticket in [ticket for ticket in self._joins if ticket.finished]:
             self._joins.remove(ticket)
             self._block(ticket.blocked, states.IDLE)

@@ -6,7 +6,7 @@ _DAY = 86_400.0
 
 
 def day_of(at: float, site: Site) -> int:
-    """Return the number of the day of local mean solar time, from 1970."""
+    """Return the day number, in local mean solar time, counted from 1970."""
     return int((at + _ahead(site)) // _DAY)
 
 

@@ -28,7 +28,7 @@ _LATELY = 86_400.0
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity that has a trend: its name, its unit, and whether each heliostat has its own."""
+    """A quantity that has a trend: its name, its unit, and whether it exists per heliostat."""
 
     name: str
     unit: str
@@ -128,7 +128,7 @@ def trend(
 def thinned(
     at: FloatArray, values: FloatArray, since: float, until: float, points: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return times, minima, means and maxima of the equal intervals that contain values, (K,)."""
+    """Return times, minima, means and maxima, (K,), for the equal intervals that contain values."""
     known = np.isfinite(values)
     at, values = at[known], values[known]
     if len(at) <= points:

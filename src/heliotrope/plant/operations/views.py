@@ -77,7 +77,7 @@ class FieldFrame:
 
 @dataclass(frozen=True)
 class SunView:
-    """The sun at a time: unit vector (3,), azimuth and elevation, rad."""
+    """The sun at one time: unit vector, (3,); azimuth and elevation, rad."""
 
     at: datetime
     direction: FloatArray

@@ -456,7 +456,10 @@ class Authority:
         return self._grant
 
     def _give_up(self) -> None:
-        """End the grant. Open mandates continue under a token of the plant itself."""
+        """End the grant.
+
+        Open mandates continue under a token of the plant itself.
+        """
         self._grant, self.changed_at = None, self._clock.monotonic()
         self._own = self._drawn() if self._mandates else 0
 

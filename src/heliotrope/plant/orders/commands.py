@@ -266,7 +266,7 @@ class Commands:
         """Declare the step counts of the axes of one heliostat that is locked or has a fault.
 
         Nothing moves; its local controller stores the counts. This requires an engineer, and the
-        heliostat's key in its cluster.
+        heliostat's key stored in its cluster.
 
         Parameters
         ----------

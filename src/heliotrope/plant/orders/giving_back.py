@@ -70,7 +70,7 @@ class GivingBack(Part):
             self._locks.sent(what, self._ordered(what, tuple(names)))
 
     def _ordered(self, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Order heliostats that were left locked; return those that need no other order."""
+        """Order heliostats that were left locked; return heliostats that need no other order."""
         if what == "STOW":
             held = self._guards.reasons(Asked(what, names), NOT_NOW)
             free = tuple(name for name in names if name not in held)

@@ -1,10 +1,10 @@
-"""Aims that visits have moved, and the aims to which the beams return.
+"""The aims that visits have moved, and the aims to which the beams return.
 
 A receiver visit moves beams by a milliradian; a visit to a target gives heliostats an aim there. So
 that the beams return whatever happens to the visit, the plant itself sends each beam back to its
 aim (`giving_back`): when the visit requests it, when a small movement has not been renewed for a
-while, and when the mandate or the command authority under which it was moved has ended. That
-requires a command authority, because clusters accept no other commands.
+while, and when the mandate or the command authority under which it was moved has ended. Sending
+beams back requires a command authority, because clusters accept no other commands.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -165,7 +165,7 @@ class Movements:
 
     @contextmanager
     def ending(self, heliostats: Collection[str]) -> Iterator[None]:
-        """Send the beams of heliostats back at the end of a block, however it ends."""
+        """Send the beams of heliostats back at the end of a block, however the block ends."""
         try:
             yield
         finally:

@@ -1,4 +1,4 @@
-"""Parameters of local controllers: compared with the desired ones on connection, then sent."""
+"""Parameters of local controllers: on connection, they are compared and, if needed, written."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -82,7 +82,7 @@ def change_of_beam(before: Tables, after: Tables, aims: npt.ArrayLike) -> float:
 
 
 def stored_items(answer: Answer) -> dict[str, bytes]:
-    """Return the items in a reply to ``stored``; none if the cluster could not read them.
+    """Return the items in a reply to ``stored``; no items if the cluster could not read them.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def stored_items(answer: Answer) -> dict[str, bytes]:
 
 
 class ParameterSync(Part):
-    """Compares the stored parameters with the desired parameters, and writes those that differ.
+    """Compares the stored with the desired parameters, and writes parameters that differ.
 
     Parameters
     ----------
@@ -164,14 +164,14 @@ class ParameterSync(Part):
     def on_stage(
         self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
     ) -> None:
-        """Compare heliostats that lacked parameters once they have a point."""
+        """Compare heliostats that lacked parameters, once they have an assigned point."""
         del now
         if stage is Stage.DONE and ticket.name in KINDS:
             for name in self._wanted.missing.keys() & heliostats:
                 self.compare(name)
 
     def greet(self, heliostats: Sequence[str]) -> None:
-        """Compare heliostats before they may move, because any boards may respond there.
+        """Compare heliostats before they may move, because their boards may have been replaced.
 
         Their cluster has connected, or their boards have restarted.
         """

@@ -61,7 +61,7 @@ class _Under:
 
 @dataclass
 class _Recording:
-    """Records that must be on disk before heliostats of a ticket are sent their command."""
+    """Records that must be on disk before the heliostats of a ticket are sent their command."""
 
     ticket: Ticket
     heliostats: tuple[str, ...]
@@ -468,7 +468,7 @@ class PlantOrders(Part):
         self._stow(self._stowing.due(now))
 
     def to_stow(self, heliostat: str) -> bool:
-        """Whether a heliostat waits for its turn to go to stow, and so must not be moved."""
+        """Whether a heliostat waits for its turn to go to stow, and must not move elsewhere."""
         return heliostat in self._stowing
 
     def _stow(self, parts: Mapping[Ticket, Sequence[str]]) -> None:
@@ -531,7 +531,7 @@ class PlantOrders(Part):
         self._under[identity].given, self._under[identity].again = token, again
 
     def _own(self, identity: str, token: int) -> int:
-        """Return the token with which a message is sent now; 0: it may no longer be sent."""
+        """Return the token with which a message is sent now; 0 if it may no longer be sent."""
         own = self.authority.present(token)
         if own and identity in self._under:
             self._under[identity].token, self._under[identity].ticket.sent = own, True

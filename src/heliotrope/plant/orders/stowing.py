@@ -1,4 +1,4 @@
-"""The queue for an ordinary STOW of many heliostats, which start one after the other.
+"""The queue for an ordinary STOW of many heliostats, so that they start one after the other.
 
 Like STOW ALL of Malan's controller (thesis, table D.1, 0xD9), it protects the power supply from the
 current of all drives starting together. Emergencies, the safety table and expired leases never wait

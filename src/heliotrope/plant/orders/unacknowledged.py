@@ -27,7 +27,7 @@ _NOT_TAKEN = {"AIM": AIM_NOT_TAKEN, "STANDBY": STANDBY_NOT_TAKEN}
 
 
 class Unacknowledged(Part):
-    """The last ticket of each heliostat's points that may not have been accepted.
+    """For each heliostat, the last ticket for a point that may not have been accepted.
 
     Parameters
     ----------

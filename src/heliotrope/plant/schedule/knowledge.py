@@ -220,7 +220,7 @@ class Knowledge:
         return Fleet(self.mechanism, self.names, known, form, self._aim, sigma, tuple(labels))
 
     def assume(self, row: int, slope: FloatArray, now: float) -> None:
-        """Assume that a visit with this slope (2, P) has been made."""
+        """Assume that a visit with the derivative ``slope`` (2, P) has been made."""
         rows = np.array([row], dtype=np.intp)
         self.covariance[row] = _gain.updated(self.faded(rows, now)[0], slope)
         self._set(rows, now)
@@ -238,7 +238,7 @@ class Knowledge:
         self._set(np.array([row], dtype=np.intp), record.at)
 
     def doubt(self, row: int, factor: float) -> None:
-        """Multiply the variances by a factor, because the beam was found elsewhere."""
+        """Multiply the variances by a factor, because the beam was far from its prediction."""
         self.covariance[row] *= factor
         self._set(np.array([row], dtype=np.intp), float(self.since[row]))
 
@@ -323,7 +323,7 @@ class FieldKnowledge:
         return other
 
     def squares(self, now: float) -> FloatArray:
-        """Return the expected squared beam errors over the year at a time, rad², (N,)."""
+        """Return the squared beam errors over the year, as expected at a given time, rad², (N,)."""
         found = np.empty(len(self))
         for known, rows in zip(self._groups, self._rows, strict=True):
             found[rows] = known.expected(now)
@@ -368,7 +368,7 @@ class FieldKnowledge:
         return found, np.concatenate(self._rows)
 
     def assume(self, row: int, slope: FloatArray, now: float) -> None:
-        """Assume that a visit with this slope (2, P) has been made."""
+        """Assume that a visit with the derivative ``slope`` (2, P) has been made."""
         self._groups[self.group[row]].assume(int(self._place[row]), slope, now)
 
     def learn(self, row: int, record: HeliostatCalibration) -> None:

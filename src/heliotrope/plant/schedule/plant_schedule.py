@@ -51,7 +51,7 @@ def settings_for(cycle: CycleSettings, settings: Settings | None = None) -> Sett
 
 
 class PlantSchedule:
-    """Choice of heliostats by expected gain, in a running plant.
+    """Chooses heliostats by expected gain, in a running plant.
 
     Parameters
     ----------

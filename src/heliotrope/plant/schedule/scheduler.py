@@ -451,7 +451,7 @@ class Scheduler:
     def prospect(
         self, now_utc: datetime, able: Mask, targets: Sequence[str]
     ) -> FieldProspect | None:
-        """Return the present knowledge, from which to predict the day; None without targets.
+        """Return the present knowledge, for predicting the day; None if there are no targets.
 
         Parameters
         ----------

@@ -253,7 +253,7 @@ class CalibrationCycle:
         return CycleResult(heliostat, CalibrationOutcome.UNCHANGED, text)
 
     def _missed(self, heliostat: str, taken: Photographs) -> float:
-        """Return the beam error of photographs under the present belief, rad RMS."""
+        """Return the beam error of photographs under the present calibration, rad RMS."""
         seen = join([self._sighting(shot, counts) for shot, counts in taken.used])
         return root_mean_square(beam_errors(self._plant.beliefs.present(heliostat), seen).beam)
 
@@ -293,7 +293,7 @@ class CalibrationCycle:
     async def alone(
         self, target: Target, heliostat: str, shot: Shot, standing: Standing | None
     ) -> Shot:
-        """Return a shot corrected for obstruction by neighbours; see `Unhidden.shot`."""
+        """Return a shot, corrected for obstruction by neighbours; see `Unhidden.shot`."""
         if self.unhidden is None:
             return shot
         return await self.unhidden.shot(target, heliostat, shot, standing)

@@ -2,8 +2,8 @@
 
 During a series of photographs, each beam moves according to its code (`imaging.coded`); a
 photograph is taken only when all beams have settled. Each identified beam is a sighting, which is
-processed like that of an ordinary visit, with one fit, the same safeguards, and verification. Beams
-that are not identified are reported, and nothing is learnt from them.
+processed like a sighting of an ordinary visit, with one fit, the same safeguards, and verification.
+Beams that are not identified are reported, and nothing is learnt from them.
 
 A visit to a target is a *joint visit*, a visit of heliostats that track a receiver is a *receiver
 visit*. They differ in how beams arrive and leave, in their light, and in the use of new parameters.
@@ -154,7 +154,7 @@ class _Taken:
         return [(number, await one.light) for number, one in self.pictures]
 
     def forget(self) -> None:
-        """Drop all photographs, evaluated or not; a full cycle begins with the next number."""
+        """Drop all photographs, evaluated or not; a full cycle begins with the next photograph."""
         self.first = self.number
         for _, one in self.pictures:
             one.light.cancel()

@@ -36,8 +36,8 @@ def moments_on(
 ) -> FloatArray:
     """Return the second moments of beams on a target, m², (..., 2, 2).
 
-    They combine the image of the sun, widened by the mirror's slope errors, and the mirror itself,
-    seen along the beam.
+    A beam combines the image of the sun, widened by the mirror's slope errors, and the outline of
+    the mirror as seen along the beam.
 
     Parameters
     ----------

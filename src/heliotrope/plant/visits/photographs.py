@@ -100,7 +100,7 @@ class Photographing(Protocol):
 
 
 class Plain:
-    """Photographs of the beam in its present position, without search or centring."""
+    """Photographs of the beam in its present position, without searching or centring."""
 
     def __init__(self, camera: TargetCamera, settings: CycleSettings) -> None:
         self._camera, self._settings = camera, settings
@@ -190,7 +190,7 @@ class Centred:
     async def _centre(
         self, visit: Visit, aim: FloatArray, place: FloatArray, tell: Tell
     ) -> "_Light":
-        """Move the aim by the distance of the beam from the middle."""
+        """Move the aim by the beam's offset from the middle."""
         target = visit.target
         if np.linalg.norm(place) <= self._centring.near * min(target.width, target.height):
             return _Light(aim, aim, place)
@@ -268,7 +268,7 @@ class _Light:
 
 
 def room_of(visit: Visit, centring: Centring) -> float:
-    """Return how far the beam may be moved off the middle of the target, right and up, m."""
+    """Return how far the beam may be moved from the middle of the target, right and up, m."""
     target, plant, row = visit.target, visit.plant, visit.row
     group, place = plant.design.find(visit.heliostat)
     mirror = 0.5 * math.hypot(float(group.width[place]), float(group.height[place]))

@@ -1,4 +1,4 @@
-"""The light on a surface, seen from its front, and the beams that compose it."""
+"""The light on a surface, as seen from its front, and the beams that it consists of."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
@@ -31,7 +31,7 @@ class TargetLight:
     Attributes
     ----------
     values
-        Brightness over full scale, (H, W), row 0 at the top.
+        Brightness as a fraction of full scale, (H, W), row 0 at the top.
     step
         Size of a pixel, m.
     first
@@ -73,7 +73,7 @@ class TargetLight:
 
     @property
     def brightness(self) -> float:
-        """Mean brightness over full scale, at an exposure of 1."""
+        """Mean brightness as a fraction of full scale, at an exposure of 1."""
         return float(self.values[self.seen].mean()) / self.exposure
 
     def covariance_at(self, place: FloatArray) -> FloatArray:

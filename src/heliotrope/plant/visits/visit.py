@@ -295,7 +295,7 @@ class Visit(BroughtHome):
         return self.left() < ARRIVED and not coarse
 
     def left(self) -> float:
-        """Return how far the axes are from their goals, rad, for the axis that is further away."""
+        """Return the distance of the axes from their goals, rad; the larger of the two."""
         node = self.plant.field.rows[self.row]
         here = np.array([node["primary"], node["secondary"]], dtype=np.float64)
         goal = np.array([node["primary_goal"], node["secondary_goal"]], dtype=np.float64)
@@ -383,7 +383,7 @@ class Visit(BroughtHome):
 
     @property
     def counted(self) -> tuple[FloatArray, FloatArray]:
-        """The recorded times, monotonic s, (R,), and step counts, (R, 2)."""
+        """The recorded times, monotonic s, (R,), and the step counts at these times, (R, 2)."""
         return np.array(self._times), np.array(self._counts).reshape(-1, 2)
 
     def taken_off(self) -> None:

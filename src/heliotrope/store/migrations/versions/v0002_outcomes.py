@@ -1,4 +1,4 @@
-"""Outcomes by name, the origin of a calibration, and sightings left out of a fit."""
+"""Stores outcomes by name, the origin of a calibration, and sightings left out of a fit."""
 
 from alembic import op
 from sqlalchemy import Boolean, Column, Text, column, false, table, true, update
