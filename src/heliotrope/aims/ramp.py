@@ -39,7 +39,7 @@ def ramp_up(aims: SceneAims, rate: float, step: float = 60.0) -> FloatArray:
     joins = np.full(count, np.nan)
     joining = ~aims.defocused & (aims.engine.leaving > 0.0)
     turn = (np.arange(count) * 0.6180339887498949) % 1.0
-    # Neighbours one after the other would fill the same cells first.
+    # If neighbours joined one after the other, they would fill the same cells first.
     waiting = [int(row) for row in np.argsort(turn, kind="stable") if joining[row]]
     flux, peak = np.zeros(images.shape[::-1]), float(aims.engine.maps[0].max())
     if peak > MOST * rate * step:

@@ -27,9 +27,9 @@ from heliotrope.optics.scene import Scene
 ALIKE = 0.05
 #: Maximum number of positions on a beam's path at which its image is computed; one per beam width.
 PLACES = 9
-#: New aims are adopted if they add this share of power, or if the old aims exceed the limit.
+#: New aims are adopted if they add this fraction of power, or if the old aims exceed the limit.
 BETTER = 5e-3
-#: Excess over the limit that counts as zero, and the share of the limit from which a cell binds.
+#: Excess over the limit that counts as zero, and the fraction of the limit from which a cell binds.
 HOLDS, BINDS = 3e-3, 0.99
 #: Maximum number of heliostats whose moves are examined in one round.
 LOOKED = 400
@@ -38,9 +38,9 @@ THINNER = 0.85
 #: Age at which images are computed anew, s.
 FRESH = 600.0
 
-#: Multiples of the golden ratio less their whole parts spread evenly.
+#: The fractional parts of the multiples of the golden ratio are evenly spread.
 GOLDEN = 0.6180339887498949
-#: Share of the mirrors that rest before it is computed anew which others must.
+#: Fraction of the mirrors that rest before the mirrors that must also rest are computed anew.
 SHED = 0.01
 
 Mask = npt.NDArray[np.bool_]
@@ -229,7 +229,7 @@ def steps(
     """
     aimed, goes = _aimed(now.aims), _aimed(target_aims)
     if not aimed.any() and now.ramp is None:
-        # No mirror shines, so all may take their best aims at once.
+        # No beam is on the receiver, so all mirrors may take their best aims at once.
         return ((Move(np.flatnonzero(goes), target_aims[goes]),) if goes.any() else ()), 0
     taken = aimed & ~now.free
     path = _Path(now, target_aims, light)

@@ -35,13 +35,13 @@ from heliotrope.sun import Site
 CLUSTER = 32
 #: Number of heliostats in a triangle.
 PACK = 6
-#: Share of the ground that the mirrors of Malan's twin field cover.
+#: Fraction of the ground that the mirrors of Malan's twin field cover.
 PACKING = 0.5
 #: Maximum number of heliostats in a layout.
 MOST = 1_000_000
 #: Radius around masts and cameras that is kept free of mirrors, m.
 FREE = 6.0
-#: Steps per turn of a joint; speed of its motor, steps/s.
+#: Steps per revolution of a joint; speed of its motor, steps/s.
 _STEPS, _RATE = 400_000, 8000.0
 #: Final approach from below, steps; angles by which both axes turn away at a defocus, rad;
 #: elevation at stow, and the lowest at which a mirror is turned away there, rad.

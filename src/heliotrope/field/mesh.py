@@ -8,7 +8,8 @@ import numpy as np
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_vectors
 
-#: Most triangles of a mesh: with 10,000 mirrors, half a minute for one sun position.
+#: Maximum number of triangles of a mesh; with 10,000 mirrors, one sun position then takes half a
+#: minute.
 MOST_FACES = 100_000
 #: Smallest triangle, m².
 _LEAST_AREA = 1e-10

@@ -30,7 +30,7 @@ from heliotrope.sun import Site, check_site
 from heliotrope.values import Card, Value, amount, dots
 
 Surface = TypeVar("Surface", Target, Receiver, Camera)
-#: Positions are one place if they are alike when rounded to this, m.
+#: Positions count as the same place if they are equal when rounded to this, m.
 _ONE_PLACE = 0.01
 
 
@@ -106,7 +106,7 @@ class Plant(Value, Framed):
             for target in camera.targets:
                 self.target(target)
         if self.receiver_visits is not None:
-            # Both must be known: the camera's place, and a face that it can see.
+            # Two things must be known: the camera's position, and a face that it can see.
             _ = self.receiver(self.receiver_visits.receiver).face
             _ = self.camera(self.receiver_visits.camera).pose
         if self.aims.limit is not None and len(self.receivers) != 1:

@@ -31,18 +31,18 @@ from heliotrope.mechanism.drives import rotary
 from heliotrope.mechanism.machine import Machine, Stepping
 from heliotrope.sun import Site
 
-#: Steps of a motor's turn, microsteps of a step, and turns of the worm to a turn of the joint.
+#: Steps per motor revolution, microsteps per step, and worm revolutions per joint revolution.
 STEPS, MICROSTEPS, WORM = 200, 8, 30
 #: The heliostat of 6.3: m east, north, and up to its pivot.
 _PLACE, _PIVOT_HEIGHT = (19.2, -30.8), 1.2
 #: Side of a mirror and of a target; heights of the targets' centres, m.
 _MIRROR, _TARGET = 0.3, 2.0
 _LOWER, _UPPER = 13.0, 17.0
-#: Distance of neighbouring heliostats of a structure, and of the structures' middles, m.
+#: Distance between neighbouring heliostats of a structure, and between the structures' centres, m.
 _SPACING, _APART = 0.75, 3.0
 #: The camera, m: in front of the lower target, above the ground, and to the right of the target.
-#: From here, no sun of the year above 8° comes nearer than 17° to its line of sight; from the
-#: middle, a winter's sun is behind the target for an hour in the afternoon.
+#: From here, no sun position above 8° comes nearer than 17° to the camera's line of sight in a
+#: year; from the middle, the winter sun is behind the target for an hour in the afternoon.
 _CAMERA = (30.0, 3.0, -20.0)
 #: Steps/s of the motors: 7.5 °/s of the joint.
 _RATE = 1000.0

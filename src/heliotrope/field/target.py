@@ -148,7 +148,7 @@ class Target(Value):
         o, d = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
         towards = np.asarray(d @ self.normal)
         gap = np.asarray((self.center - o) @ self.normal)
-        # The beam must come from the front, so against the normal.
+        # The beam must come from the front, that is, against the normal.
         length = np.where(towards < 0.0, gap / np.where(towards == 0.0, 1.0, towards), np.nan)
         length = np.where(length > 0.0, length, np.nan)
         return o + length[..., None] * d
@@ -298,7 +298,7 @@ class Receiver(Value):
         """The flat rectangle with the receiver's width and height about its centre."""
         corners = self.corners
         if corners is None:
-            # An aperture that looks straight up or down has no upper edge of its own.
+            # An aperture that faces straight up or down has no natural upper edge.
             level = np.cross([0.0, 0.0, 1.0], self.normal)
             steep = np.linalg.norm(level) < 1e-9
             right = np.array([1.0, 0.0, 0.0]) if steep else normalize(level)

@@ -18,7 +18,8 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.files.cells import check_names
 from heliotrope.geometry import FloatArray
 
-#: Length of a day, s; the shortest interval, s; most entries, and most times of day of one.
+#: Length of a day, s; shortest interval, s; maximum number of entries, and of times of day of an
+#: entry.
 DAY, LEAST_INTERVAL, MOST, MOST_TIMES = 86_400.0, 60.0, 100, 96
 
 

@@ -174,7 +174,8 @@ def _shadow(start: FloatArray, end: FloatArray, circle: FloatArray) -> FloatArra
     flat = float(np.hypot(axis[0], axis[1]))
     along = axis[:2] / flat if flat > 0.0 else np.array([1.0, 0.0])
     across = np.array([-along[1], along[0]])
-    # An end is a disc: upright it is a circle, lying down a line across.
+    # An end is a disc: seen from above, it is a circle on an upright cylinder, and a line on a
+    # horizontal one.
     disc = circle[:, :1] * abs(axis[2]) * along + circle[:, 1:] * across
     ahead = circle[:, :1] >= 0.0
     return np.asarray(np.where(ahead, end[:2], start[:2]) + disc)

@@ -20,11 +20,11 @@ from heliotrope.jit import INLINED, INNER, OPTIONS, plain
 
 #: Numbers of a mirror's row; of a tower's (east, north, radius, bottom, top).
 SIZE, TOWER = 16, 5
-#: Corners of a polygon at most: a tower's top, cut twice.
+#: Maximum number of corners of a polygon: a tower's top, cut twice.
 CORNERS = 32
 #: Corners of a tower's top.
 ROUND = 24
-#: Pieces below this share of the mirror's area are dropped.
+#: Pieces below this fraction of the mirror's area are dropped.
 SPECK = 1e-13
 
 

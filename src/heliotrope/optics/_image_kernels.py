@@ -26,9 +26,10 @@ from heliotrope.optics._clip_kernels import part_of
 IMAGE = 6
 #: Exponent beyond which a Gaussian is left out: 1e-7 of its peak.
 DEEP = 16.0
-#: Parts whose images differ in place by less than this share of the blur are merged.
+#: Parts whose image positions differ by less than this fraction of the blur are merged.
 CLOSE = 0.7
-#: Exponent beyond which the sum of a Gaussian's values at cells counts as exact: to 1e-4.
+#: Exponent beyond which the sum of a Gaussian's values at cells is taken to be exact; the error is
+#: 1e-4.
 WIDE = 10.0
 FLAT, ROUND = 0, 1
 _FAST = {**OPTIONS, "fastmath": {"contract", "nsz", "arcp", "nnan"}}

@@ -31,7 +31,7 @@ SPHERE, BOX, CYLINDER, PRISM = range(4)
 SIZE = 10
 #: A beam closer to a volume than this (m) counts as inside it.
 TOUCH = 1e-3
-#: Steps of one march; where they run out the beam counts as in the volume.
+#: Maximum number of steps of one march; if they run out, the beam counts as in the volume.
 STEPS = 2000
 
 

@@ -58,7 +58,7 @@ def canted(
     else:
         tilt, focal = _off_axis(center, canting, plant, aim), mirrors.slant
     own = np.broadcast_to(mirrors.focal[:, None], center.shape[:2])
-    # The mirror's own focal length serves to cast what its neighbours hide.
+    # The mirror's own focal length is used only for casting the shadows of its neighbours.
     return replace(mirrors, focal=focal).with_facets(FacetTable(center, tilt, half, own))
 
 

@@ -19,7 +19,7 @@ from heliotrope.files.text import write_file
 from heliotrope.geometry import FloatArray
 from heliotrope.optics.plant_flux import EFFICIENCIES, FluxTable, PlantFlux
 
-#: Columns of a table of heliostats, as SolarPILOT exports them.
+#: Columns of a heliostat table, as SolarPILOT exports them.
 HELIOSTAT_COLUMNS = (
     "Heliostat ID", "Pos-x", "Pos-y", "Pos-z", "Aim-x", "Aim-y", "Aim-z", "Reflectivity",
     "Soiling", "Total eff", "Cosine eff", "Attenuation", "Blocking", "Shading",
@@ -195,7 +195,7 @@ def write_solartherm(path: str | Path, table: FluxTable) -> None:
 
 
 def _texts(values: FloatArray, digits: int) -> list[str]:
-    # Adding 0 takes the sign from what rounds to −0.
+    # Adding 0 removes the sign from numbers that round to −0.
     rounded = np.round(values, digits) + 0.0
     return ["" if np.isnan(v) else f"{v:.{digits}f}" for v in rounded.tolist()]
 

@@ -32,7 +32,7 @@ BURN, WIDE = 1180.0, 0.118
 #: Retinal irradiance that leaves an after-image at 1 rad, W/m² (3.59e-5 W/cm²), and the power
 #: of the angle by which the threshold falls.
 FLASH, FLASH_POWER = 0.359, 1.77
-#: Smaller sources count as this large, rad: far below the blur of any eye.
+#: Smaller sources are treated as this large, rad, which is far below the blur of any eye.
 SMALLEST = 1e-6
 
 

@@ -22,8 +22,8 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, common_shape
 from heliotrope.optics.beam import SUN_RADIUS, checked
 
-# Nodes of the integral over a circle, and how many σ of the beam it covers: what it leaves
-# out is 2e-17.
+# Number of nodes of the integral over a circle, and how many σ of the beam it covers; it omits
+# 2e-17 of the beam.
 _NODES = 128
 _REACH = 8.5
 

@@ -414,7 +414,8 @@ def _angles(
     tracking = track(armature, s, aims, drives=drives)
     angles, status, before = np.empty((len(aims), 2)), np.empty(len(aims), np.int8), stow
     for k in range(len(aims)):
-        # A whole turn of a joint leads to the same pose; without drives, no stop prevents it.
+        # A full revolution of a joint results in the same pose; without drives, no stop prevents
+        # it.
         options = tracking.angles[k]
         if drives is None:
             options = before + (options - before + np.pi) % (2.0 * np.pi) - np.pi

@@ -67,7 +67,7 @@ class Neighbours:
         met = points[:, None, :] + along[..., None] * ray[:, None, :] - self.center
         across = np.abs(np.einsum("ejc,jac->eja", met, tangent_axes(self.normal)))
         half = 0.5 * np.stack([self.width, self.height], axis=-1)
-        # Parallel rays give infinities or NaN, which are within nothing.
+        # Parallel rays result in infinities or NaN, which lie within no bounds.
         within = (across <= half).all(axis=-1) & (along > 0.0)
         return np.asarray(within.any(axis=1))
 

@@ -22,9 +22,9 @@ from heliotrope.mechanism.tracking import track
 from heliotrope.optics.scene import FacetTable, Mirrors, Scene
 from heliotrope.optics.surfaces import Surface, surface_of
 
-#: Slope error of mirrors of which nothing is known, rad.
+#: Slope error of mirrors about which nothing is known, rad.
 USUAL_SLOPE = 1e-3
-#: Reflectivity of mirrors of which nothing is known.
+#: Reflectivity of mirrors about which nothing is known.
 USUAL_REFLECTIVITY = 0.9
 #: A facet with a slope map is divided into at most this many parts each way.
 _PARTS = 8
@@ -170,7 +170,7 @@ def shaped(
     lengths = np.ones(len(plant))
     lengths[index] = focal
     table = _table(groups, lengths, own_focal=focus == "plant", own_slope=slope is None)
-    # The mirror's own focal length serves to cast what its neighbours hide.
+    # The mirror's own focal length is used only for casting the shadows of its neighbours.
     return replace(made, focal=_whole_focal(table)[index]).with_facets(table, np.asarray(index))
 
 

@@ -11,13 +11,16 @@ from heliotrope.geometry import FloatArray, as_float, normalize, reflect
 from heliotrope.optics.beam import SUN_RADIUS, Beams, MirrorOptics, crossing
 from heliotrope.optics.keep_out import bounds, find_entries
 
-#: Largest declination of the sun, rad, and room for refraction, which lifts a sun at the horizon.
+#: Largest declination of the sun, rad, and allowance for refraction, which lifts the sun at the
+#: horizon.
 _TROPIC, _REFRACTION = float(np.radians(23.45)), float(np.radians(0.6))
-#: Angle between neighbouring suns of the year, rad; no sun is further than 0.71 of it from one.
+#: Angle between neighbouring sun positions of the year, rad; no sun position is further than 0.71
+#: of this angle from a computed one.
 _STEP = float(np.radians(1.0))
-#: Points at which `hottest` asks for the light of all beams, at first.
+#: Number of points at which `hottest` first computes the irradiance from all beams.
 _POINTS = 1000
-#: Points of each beam on both sides of the place, and steps of the search about the hottest, m.
+#: Number of points of each beam on both sides of the place, and steps of the search about the
+#: hottest point, m.
 _ALONG, _COARSE, _FINE = 25, 4.0, 0.2
 #: Pairs of a point and a beam that are computed at once.
 _PAIRS = 200_000
@@ -76,7 +79,7 @@ def entered_over_the_year(
         path = center - vertex
         distance = np.linalg.norm(path, axis=-1)
         share = (radius + mirrors.half_diagonal) / np.maximum(distance, 1e-9)
-        # All suns whose beams may touch the ball about the volume are in this cone.
+        # All sun positions whose beams may touch the sphere about the volume are in this cone.
         room = np.arcsin(np.minimum(share, 1.0)) + wide.spread
         room = np.where(share >= 1.0, np.pi, room)
         toward = reflect(normalize(path, "center - vertex"), normal)

@@ -335,7 +335,8 @@ def _fitted(shape: SunShape, count: int, blur: float) -> Gaussians:
         # Nearly equal Gaussians with huge weights of opposite sign are of no benefit.
         return float(rest @ rest / (true * root @ (true * root)) + 3e-6 * w @ w)
 
-    # Starts for the disk alone, near and far from each other, and with one or two for an aureole.
+    # Starting points: for the disk alone, near and far from each other; and with one or two for an
+    # aureole.
     disk = np.log(SUN_SIGMA**2 / total)
     near, far = (disk + np.linspace(np.log(a), np.log(0.8), count) for a in (0.45, 0.2))
     begins = [near, far, np.append(far[1:], 2.0), np.append(near[:-1], 1.0)]

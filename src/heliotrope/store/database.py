@@ -317,7 +317,7 @@ def make_private(folder: Path) -> None:
     folder.mkdir(exist_ok=True)
 
 
-#: What a plant creates in its data folder, beside the store.
+#: Files and folders that a plant creates in its data folder, beside the store.
 MADE = ("telemetry", "targets", "marks", "photographs", "interface", "first-password")
 
 

@@ -26,7 +26,7 @@ SUFFIX = ".h5"
 # Maximum number of cells along an edge of a facet, and points per cell, because a mean of few
 # points is noisy.
 _CELLS, _POINTS = 64, 4
-# Minimum fraction of the points that must lie on their facet; the others are at its rim.
+# Minimum fraction of the points that must lie on their facet; the rest may be at its rim.
 _ON_FACET = 0.5
 _WHAT = "a deflectometry file in PAINT's form (.h5)"
 

@@ -25,7 +25,8 @@ from heliotrope.field.heliostats import Heliostats
 from heliotrope.files import read_text, write_file, write_text
 from heliotrope.files.documents import read_toml
 
-#: Smaller units in which a value may be entered, by the unit of its column, and their size in it.
+#: Smaller units in which a value may be entered, by the unit of its column, and their size in this
+#: unit.
 _SMALLER = {"rad": {"mrad": 1e-3, "deg": np.pi / 180.0}, "m": {"mm": 1e-3}}
 _TEXTS = ("cluster", "group")
 _NOTE = "change.txt"

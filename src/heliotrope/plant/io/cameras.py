@@ -348,7 +348,7 @@ class RealCameras:
                     self._tell(target)
                 return frame
             if frame is not last:
-                # It was on its way already, or the camera's clock is a little behind.
+                # The frame was already on its way, or the camera's clock is slightly behind.
                 last = frame
                 eye.feed.ask()
             await asyncio.sleep(_LOOK)

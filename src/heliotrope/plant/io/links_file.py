@@ -150,9 +150,9 @@ class LinksDocument(Table):
     )
 
 
-#: Says that programs give a reading, in place of the name of a file.
+#: Value that says, in place of a file name, that programs supply a reading.
 GIVEN = "api"
-#: Says that the receiver's camera gives its flux.
+#: Value that says that the receiver's camera measures its flux.
 CAMERA = "camera"
 #: The tables, for the reference and for hints.
 TABLES: tuple[type[Table], ...] = (

@@ -152,7 +152,7 @@ class Keeping:
 
     def _keep(self, records: Records, record: HeliostatCalibration) -> None:
         if (record.sightings == 0).any():
-            return  # its sightings could not be kept; `lost` says why
+            return  # the sightings could not be kept; `lost` says why
         try:
             records.record_calibration(record)
         except StoreError as error:

@@ -25,9 +25,10 @@ from heliotrope.plant.operations.views import CalibrationEntry, CameraView, Pict
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.target_light import Exposed, LightCamera, TargetLight
 
-#: Maximum number of photographs kept of one visit; of a long search, the last ones.
+#: Maximum number of photographs kept of one visit; of a long search, the last photographs are kept.
 _MOST = 24
-#: The same for a coded visit; of a long series or of several, the last ones.
+#: The same for a coded visit; of a long series, or of several series, the last photographs are
+#: kept.
 _MOST_CODED = 32
 #: Interval between checks for pictures that are too old, s.
 _THIN_EVERY = 600.0

@@ -24,7 +24,7 @@ from heliotrope.store.records import Kind
 
 #: Time for which a frame is reused, s of plant time.
 _EVERY = 1.0
-#: An aim at up to this many half diagonals from the centre of a surface counts as on it.
+#: An aim within this many half diagonals of the centre of a surface counts as on the surface.
 _NEAR = 1.0
 #: Supply voltage of a board that has not reported it yet, mV.
 _UNTOLD = 0

@@ -28,7 +28,7 @@ Pointing = Callable[[Person, int, Mapping[str, FloatArray]], Ticket]
 
 #: Time limits for an order, and for the path to standby, s.
 _ORDER, _HOME = 60.0, 120.0
-#: A goal that has just moved with the sun leaves an axis at most this far from it, rad.
+#: A goal that has just moved with the sun is at most this far from its axis, rad.
 _STEP = 1e-3
 #: When all but this fraction of heliostats are at their aims, the others are allowed as long again
 #: plus this time, s.

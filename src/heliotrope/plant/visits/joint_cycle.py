@@ -37,8 +37,8 @@ from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.target_light import Exposed, LightCamera, light_on
 from heliotrope.plant.visits.visit import Visit
 
-#: Number of sightings that a first fit needs, since all photographs of a visit agree, and others
-#: verify the fit.
+#: Number of sightings that a first fit needs. One is enough, since all photographs of a visit
+#: agree, and further photographs verify the fit.
 _FIRST = 1
 #: Verdicts on a new heliostat whose beam may be beside the target; light that does not move at its
 #: place may come from another heliostat.

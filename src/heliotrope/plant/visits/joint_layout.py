@@ -26,10 +26,10 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.coded_layout import Layout, SentBeam, beams_of, coded
 from heliotrope.plant.visits.expected_errors import expected_errors
 
-#: A beam stays this many of its standard deviations, and of those of its position, from the border.
+#: Distance of a beam from the border, in standard deviations of the beam and of its position.
 _BORDER, _PLACED = 2.0, 3.0
-#: Possible numbers of codes, for 8 to 256 photographs with movements along both axes, for 8 to 128
-#: along one.
+#: Possible numbers of codes: for 8 to 256 photographs with movements along both axes, or for 8 to
+#: 128 with movements along one axis.
 _CODES = (3, 7, 15, 31, 63, 127)
 #: Movements of a verification are up and down; those of first visits are to the right and left.
 _UP = 1

@@ -20,7 +20,7 @@ T = TypeVar("T")
 #: A pixel is left out if it is clipped to at least this degree in any photograph.
 _FULL = 0.01
 #: A beam counts as merged with other light if its power, relative to the size of its mirror,
-#: differs from that of the others by this fraction and by this many standard deviations.
+#: differs from that of the other beams by this fraction and by this many standard deviations.
 _OTHER, _SIGMAS = 0.4, 4.0
 
 

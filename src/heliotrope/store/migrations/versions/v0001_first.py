@@ -89,7 +89,7 @@ parameter_version = Table(
     _text("code"),
 )
 
-#: Which sightings a version was fitted to, in their order, and what they missed by.
+#: The sightings to which a version was fitted, in order, and their residuals.
 parameter_sighting = Table(
     "parameter_sighting",
     metadata,

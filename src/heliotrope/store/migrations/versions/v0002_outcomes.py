@@ -28,6 +28,6 @@ def upgrade() -> None:
     version = table("parameter_version", column("outcome", Text))
     for text, name in _ENDINGS.items():
         op.execute(update(version).where(version.c.outcome == text).values(outcome=name))
-    # Only fits that ended well were ever kept; other words are of imported records.
+    # Only fits that ended well were ever kept; other words come from imported records.
     known = list(dict.fromkeys(_ENDINGS.values()))
     op.execute(update(version).where(version.c.outcome.not_in(known)).values(outcome="converged"))

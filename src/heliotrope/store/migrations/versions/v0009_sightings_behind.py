@@ -52,8 +52,8 @@ parameter_sighting = Table(
     ForeignKeyConstraint(["heliostat", "version"], [version.c.heliostat, version.c.version]),
 )
 
-#: Versions of a heliostat in a row that rest on a sighting alike have one difference between the
-#: number of the version and that of the row.
+#: Successive versions of a heliostat that use a sighting in the same way have the same difference
+#: between version number and row number.
 _RUNS = """
 CREATE TABLE behind AS
 SELECT heliostat, sighting, used, MIN(version) AS version, MAX(version) AS last
