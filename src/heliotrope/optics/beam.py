@@ -327,7 +327,7 @@ def crossing(given: Beams, points: npt.ArrayLike, *, dni: float = NOMINAL_DNI) -
     Each mirror is assumed to be a disk with an ideal focus. From a point at distance d from the
     axis, the sun is visible in the part of the disk that lies within x β / |1 − x/b| of the
     distance d / |1 − x/b| from its centre. The area common to these two disks is known in closed
-    form. On the axis the result equals that of `concentration`.
+    form. On the axis the result is equal to the result of `concentration`.
     """
     p = np.atleast_2d(as_vectors(points, "points"))
     to = p[:, None, :] - given.origin

@@ -548,7 +548,7 @@ def flux_day(
     light: FieldOptics | None = None,
     **changes: Any,
 ) -> FluxTable:
-    """Return the efficiencies of a field at times with sunlight, such as those of a day.
+    """Return the efficiencies of a field at times with sunlight, such as the times of a day.
 
     Parameters
     ----------

@@ -222,8 +222,8 @@ class FieldFlux:
         Parameters
         ----------
         aims
-            ENU m, (H, K, 3). Shading, blocking and attenuation remain those of the present aims,
-            and each mirror keeps its focal length.
+            ENU m, (H, K, 3). Shading, blocking and attenuation are those at the present aims, and
+            each mirror keeps its focal length.
         reach
             Number of additional rows of each image below and above the surface, so that it can be
             moved, (H,).

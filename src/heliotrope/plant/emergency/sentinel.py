@@ -236,7 +236,7 @@ class Sentinel(Part):
 
     @property
     def _proving(self) -> EmergencyOrder | None:
-        """The order that reports now confirm: the last order, or that of the previous program."""
+        """The order that reports now confirm: the last order, or the previous program's order."""
         return self.order or self._before
 
     @property

@@ -156,7 +156,7 @@ class Points:
     names
         Names of the heliostats.
     store
-        Store of the points; None: they do not outlive the plant.
+        Store of the points; None: the points are lost when the plant's program ends.
 
     Attributes
     ----------

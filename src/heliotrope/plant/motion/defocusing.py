@@ -1,7 +1,7 @@
 """Where DEFOCUS and STOW move a beam, and which of the two takes it out of a keep-out volume.
 
 Anyone may issue both orders, and a local controller accepts them in every state, so no command
-authority is needed. The paths are those of a heliostat without a sun vector: a rotation by the
+authority is needed. The paths are the paths of a heliostat without a sun vector: a rotation by the
 defocus angles, or straight to stow, azimuth last.
 """
 

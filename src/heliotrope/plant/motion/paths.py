@@ -1,8 +1,8 @@
 """The path of a beam between two axis positions, and from stow to standby.
 
-The path is that of `lcu.motion`, with the same points, axis order and speeds. When leaving or
-reaching stow, the axes move one after the other; in every other motion both start at once, each at
-its own rate, so that the axis with the shorter motion arrives first.
+The path is the same as in `lcu.motion`, with the same points, axis order and speeds. When leaving
+or reaching stow, the axes move one after the other; in every other motion both start at once, each
+at its own rate, so that the axis with the shorter motion arrives first.
 """
 
 from collections.abc import Callable

@@ -304,7 +304,7 @@ class PathProofs:
 
     @contextmanager
     def _believing(self, row: int, tables: Tables) -> Iterator[None]:
-        """Use other tables for a heliostat within the block."""
+        """Use different mechanism tables for a heliostat within the block."""
         present = self._tables(row)
         self._check.replace(row, *tables)
         try:

@@ -58,7 +58,7 @@ def _case(
     *,
     tracks: bool,
 ) -> _Case:
-    """Return the first applicable reason among those that take precedence over all others."""
+    """Return the first applicable reason among the reasons that take precedence over all others."""
     name = shown.name
     if held := plant.lockouts.text(Kind.HELIOSTAT, name):
         return (

@@ -108,7 +108,7 @@ class Foresight:
         Parameters
         ----------
         able, ready
-            Heliostats that may be measured on this day, and those ready now, (N,).
+            Heliostats that may be measured on this day, and heliostats that are ready now, (N,).
         running
             Whether calibration is running; otherwise no prediction is made.
         """

@@ -230,7 +230,7 @@ class Keeping:
     # -- heliostats out of service, and events ---------------------------------------------
 
     def lockouts(self) -> tuple[Lockout, ...]:
-        """Return the personal locks in force, including those past their expected end."""
+        """Return the personal locks in force, including locks past their expected end."""
         if self._records is None:
             return ()
         return tuple(

@@ -179,7 +179,7 @@ class Marking:
         self._number = 0
 
     def resume(self) -> None:
-        """Load the stored views, except those that no longer match the plant's own file.
+        """Load the stored views, except views that no longer match the plant's own file.
 
         Raises
         ------

@@ -675,8 +675,8 @@ class Operations:
         heliostats
             Names; () for all.
         where
-            Receiver or target: for the first receiver the aims of the design, or those under the
-            flux limit; for others the centre.
+            Receiver or target. For the first receiver, the aims are the aims of the design, or the
+            aims under the flux limit; for any other surface, the centre.
         place
             Point on the unrolled receiver, right of and above its middle, m; see `Receiver.point`.
 

@@ -35,7 +35,7 @@ class JoiningJob:
     Attributes
     ----------
     ticket, name, values, token
-        Parts of the command; the token is that of the authority holder or of a mandate.
+        Parts of the command; the token belongs to the authority holder or to a mandate.
     waiting
         Heliostats still to be sent.
     until

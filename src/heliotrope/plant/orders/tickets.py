@@ -175,7 +175,7 @@ class Ticket:
         stage
             ACCEPTED to DONE.
         timeout
-            s, by the plant's clock; returns False when it expires.
+            Longest wait, s, by the plant's clock; when it expires, False is returned.
         """
         until = self._clock.monotonic() + timeout
         while not (self._stage >= RANK[stage]).all():

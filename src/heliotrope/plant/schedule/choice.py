@@ -286,8 +286,8 @@ class Judge:
     ) -> Choice | None:
         """Return the best visit of a chosen heliostat to any of the targets.
 
-        Overdue heliostats are ranked by age, the others by the reduction of their expected squared
-        error for each second of the visit.
+        Overdue heliostats are ranked by age, all others by the reduction of their expected squared
+        error per second of the visit.
         """
         row, place, bound = self._screen(moment, chosen, targets, overdue)
         order = np.argsort(-bound, kind="stable")

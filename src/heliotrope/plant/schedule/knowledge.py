@@ -82,7 +82,7 @@ class Knowledge:
     model
         Parameters: a name of the table, or names.
     priors
-        Standard deviations that replace those of the table, by name.
+        Standard deviations that replace the values in the table, by name.
 
     Attributes
     ----------

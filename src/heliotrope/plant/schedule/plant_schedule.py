@@ -40,7 +40,7 @@ class _Ready:
 
 
 def settings_for(cycle: CycleSettings, settings: Settings | None = None) -> Settings:
-    """Return schedule settings whose visits match those of a calibration cycle."""
+    """Return schedule settings whose visits match the visits of a calibration cycle."""
     return replace(
         settings or Settings(),
         model=cycle.first_model,

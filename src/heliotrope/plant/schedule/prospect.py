@@ -83,7 +83,7 @@ def terms_of(
     receiver: ReceiverTerms | None = None,
     receiver_visits: Sequence[ReceiverVisitTime] = (),
 ) -> CommissionTerms:
-    """Return the terms of a plan whose visits are those of a schedule.
+    """Return the terms of a plan with the visits of a schedule.
 
     Parameters
     ----------

@@ -122,7 +122,7 @@ class Comparison:
     surprises
         Heliostats whose error was more than `SURPRISE` times the expected error.
     alone
-        Number of single visits, and number of those that produced a new calibration.
+        Number of single visits, and number of single visits that produced a new calibration.
     joint_visits
         Joint visits.
     """

@@ -38,7 +38,7 @@ class Settings:
     Attributes
     ----------
     model, priors
-        Parameters that are learnt, and standard deviations that replace those of the table.
+        Parameters that are learnt, and standard deviations that replace the values in the table.
     limits
         Limits on the sun elevation, the incidence and the obliquity.
     shots, interval, sigma
