@@ -47,7 +47,7 @@ class Identities(Part):
     Attributes
     ----------
     mismatched
-        Why the board at a heliostat's address belongs to another heliostat, by heliostat name.
+        Why the board at a heliostat's address is not the heliostat's own board, by name.
     """
 
     def __init__(

@@ -75,7 +75,7 @@ class Stepping:
 
     @property
     def lent(self) -> frozenset[str]:
-        """Heliostats switched to fine steps by a visit and not covered by the plant file."""
+        """Heliostats, not listed in the plant file, that return to coarse steps after a visit."""
         return frozenset(self._open & self._rough - self._rests)
 
     def record(self, heliostats: Iterable[str]) -> Held:

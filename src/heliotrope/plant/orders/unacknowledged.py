@@ -70,7 +70,7 @@ class Unacknowledged(Part):
             self._points.taken(ticket.name, rows)
 
     def untaken(self, kind: str, heliostat: str) -> str | None:
-        """Return why a heliostat has not taken its assigned point; None if it has."""
+        """Return why a heliostat has not taken its assigned point; None if it may have."""
         last = self._tickets[kind]
         if heliostat not in last:
             return None
