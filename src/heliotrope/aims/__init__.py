@@ -1,7 +1,8 @@
 """Aim points that keep the flux on a receiver under a limit despite pointing errors.
 
 - `FluxLimit`: the allowable flux on a receiver, a number or a map (`heliotrope.field.flux_limit`);
-  `FluxTable` gives one by the fluid's temperature and velocity (`heliotrope.field.flux_table`).
+  `FluxTable` derives such a limit from the fluid's temperature and velocity
+  (`heliotrope.field.flux_table`).
 - `candidates` and `optimiser`: images of each mirror at a few aims, and the choice that maximises
   power.
 - `errors`: the uncertainty of the flux due to each mirror's own error and to shared errors.

@@ -1,6 +1,6 @@
 # mypy: disable-error-code="no-untyped-call, untyped-decorator"
 # mypy: allow-untyped-defs
-"""Compiled: prices of images, and sweeps in which each mirror takes the most valuable aim.
+"""Compiled: prices images, and lets each mirror in turn take its most valuable aim.
 
 Candidate a of mirror i is image ``a // S`` of the mirror, moved up by ``shifts[i, a % S]`` rows;
 −1 is none: the mirror is defocused. Maps are (columns, rows), so that a column lies in a row.
@@ -53,7 +53,7 @@ def _worth(i, images, shifts, price, spans, out):
 
 @njit(**_SUMS)
 def worths(first, last, mirrors, images, shifts, price, spans, out):
-    """Sum price times flux over the cells, for each candidate of ``mirrors[first:last]``.
+    """Sum price times flux over all cells, for each candidate of ``mirrors[first:last]``.
 
     ``price`` (columns, rows) in 32 bits; ``spans`` (columns, 2): rows where it is not zero; ``out``
     (H, A).
@@ -64,7 +64,10 @@ def worths(first, last, mirrors, images, shifts, price, spans, out):
 
 @njit(**_INNER_SUMS)
 def _rectangle(i, a, images, shifts, number):
-    """First column, columns, first row, end row, and position and height of a candidate's cells."""
+    """Return the first column, columns, first row, end row, position and height of the cells.
+
+    The cells are those of one candidate's image.
+    """
     _, begin, box, looks, _ = images
     count = shifts.shape[1]
     j = i * looks + a // count
@@ -154,7 +157,10 @@ def sweep(order, images, shifts, power, idle, cap, toll, steep, choice, flux, pr
 
 @njit(**_INNER_SUMS)
 def _excess(i, a, images, shifts, flux, cap, most):
-    """Excess over the cap with a candidate, summed over its cells; the sum stops at ``most``."""
+    """Return the excess over the cap with a candidate, summed over its cells.
+
+    The sum stops at ``most``.
+    """
     values, weight = images[0], images[4]
     wide, number = flux.shape
     c, columns, low, high, at, rows = _rectangle(i, a, images, shifts, number)
@@ -173,7 +179,7 @@ def _excess(i, a, images, shifts, flux, cap, most):
 
 @njit(**_INNER_SUMS)
 def _above(i, a, images, shifts, flux, cap):
-    """The present excess in a candidate's cells, without that candidate."""
+    """Return the present excess in a candidate's cells, without the candidate itself."""
     wide, number = flux.shape
     c, columns, low, high, _, _ = _rectangle(i, a, images, shifts, number)
     total = 0.0
@@ -188,7 +194,7 @@ def _above(i, a, images, shifts, flux, cap):
 
 @njit(**_SUMS)
 def settle(order, images, shifts, power, idle, cap, choice, flux, fine, fill):
-    """Let each mirror in turn take the best candidate after penalties; return the changes.
+    """Let each mirror in turn take the best candidate after penalties; return how many changed.
 
     ``fine``: penalty on the excess that a candidate adds, W per W/m². ``idle``: the value of
     sending no light, W. Without
@@ -234,7 +240,7 @@ def settle(order, images, shifts, power, idle, cap, choice, flux, fine, fill):
 
 @njit(**_SUMS)
 def place(order, images, shifts, cells, choice, flux):
-    """Let each mirror in turn aim where there is least flux.
+    """Let each mirror in turn aim where the flux is lowest.
 
     ``cells`` (H, A, 2): column and row of each candidate, −1 if the candidate is excluded.
     """

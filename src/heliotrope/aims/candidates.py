@@ -53,7 +53,7 @@ class Candidates:
 
     @property
     def table(self) -> tuple[Any, ...]:
-        """The images in the form that the kernels take."""
+        """The images in the form that the kernels expect."""
         i = self.images
         return i.values, i.begin, i.box, i.looks, self.weight
 
@@ -64,7 +64,10 @@ class Candidates:
         return float(self.power[:, middle].sum())
 
     def worth(self, price: FloatArray, mirrors: IntArray | None = None) -> FloatArray:
-        """Return the sum of price (columns, rows) times flux of each candidate, (H, K · S)."""
+        """Return the sum over cells of price times flux, for each candidate, (H, K · S).
+
+        The prices are (columns, rows).
+        """
         chosen = np.arange(len(self.weight)) if mirrors is None else mirrors
         out = np.zeros(self.aims.shape[:2])
         price32, spans = price.astype(np.float32), spans_of(price)
@@ -83,13 +86,13 @@ class Candidates:
         return flux
 
     def relit(self, weight: FloatArray) -> "Candidates":
-        """Return the candidates with a different amount of light on each mirror, (H,)."""
+        """Return the candidates for a different amount of light on each mirror, (H,)."""
         ratio = weight / np.where(self.weight > 0.0, self.weight, 1.0)
         return replace(self, weight=weight, power=as_float(self.power * ratio[:, None]))
 
 
 def spans_of(price: FloatArray) -> IntArray:
-    """Return the first and end row of each column's nonzero prices, (columns, 2)."""
+    """Return the first and the end row of the nonzero prices in each column, (columns, 2)."""
     some = (price > 0.0).astype(np.int64)
     first = some.argmax(axis=1)
     end = price.shape[1] - np.flip(some, axis=1).argmax(axis=1)
@@ -97,12 +100,12 @@ def spans_of(price: FloatArray) -> IntArray:
 
 
 def surface_in(scene: Scene) -> Plate | Cylinder:
-    """Return the one receiver of a scene.
+    """Return the only receiver of a scene.
 
     Raises
     ------
     InputError
-        If there is more than one, or it has no rows and columns.
+        If there is more than one receiver, or the receiver has no rows and columns.
     """
     if len(scene.surfaces) != 1:
         names = ", ".join(surface.name for surface in scene.surfaces)
@@ -122,7 +125,10 @@ def middles(scene: Scene) -> FloatArray:
 
 
 def _across(scene: Scene, offset: FloatArray) -> FloatArray:
-    """Return points on the receiver, at offsets (H, K) to the right as seen, m, (H, K, 3)."""
+    """Return points on the receiver, (H, K, 3), at offsets (H, K) to the right, m.
+
+    Right is as seen from each mirror.
+    """
     surface = surface_in(scene)
     if isinstance(surface, Plate):
         return as_float(surface.center + offset[..., None] * surface.right)
@@ -141,7 +147,8 @@ def candidates(engine: FieldFlux) -> Candidates:
     Parameters
     ----------
     engine
-        Flux engine of the scene, with aims on the receiver; `FieldFlux.images` says what is kept.
+        Flux engine of the scene, with aims on the receiver; see `FieldFlux.images` for what stays
+        constant.
 
     Raises
     ------

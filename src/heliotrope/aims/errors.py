@@ -65,13 +65,13 @@ class SharedErrors:
     def modes(self, mirrors: Mirrors, sun: FloatArray, pole: FloatArray) -> FloatArray:
         """Return the beam displacement by one standard deviation of each error, rad, (H, 5, 2).
 
-        Right and up as seen from the mirror; the first three modes affect the whole field, the
-        other two each cluster.
+        The displacements are to the right and up, as seen from the mirror. The first three modes
+        affect the whole field, the last two affect each cluster.
 
         Parameters
         ----------
         mirrors
-            In their poses, (H,).
+            Mirrors in their poses, (H,).
         sun
             Unit vector, (3,).
         pole
@@ -174,8 +174,8 @@ def assess(
 def gains(engine: FieldFlux, risk: Risk, prices: FloatArray) -> FloatArray:
     r"""Return the power that a perfect calibration of each mirror would add, W, (H,).
 
-    To first order, from the margin under the limit that the mirror's own error takes up:
-    $k \sum_c λ_c \, g_{ic}^\mathsf{T} Σ_i g_{ic} / 2 σ_c$.
+    The gain is computed to first order, from the part of the margin under the limit that the
+    mirror's own error takes up: $k \sum_c λ_c \, g_{ic}^\mathsf{T} Σ_i g_{ic} / 2 σ_c$.
 
     Parameters
     ----------
@@ -193,9 +193,10 @@ def gains(engine: FieldFlux, risk: Risk, prices: FloatArray) -> FloatArray:
 
 
 def _alike(rng: np.random.Generator, cells: FloatArray, width: float) -> FloatArray:
-    """Return DRAWS maps of normal random numbers that are correlated within a width, (D, C).
+    """Return DRAWS maps of normal random numbers, correlated within a width, (D, C).
 
-    Cells (C, 2): row and column. A sum of waves whose lengths have the spectrum of a Gaussian.
+    ``cells`` (C, 2) contains rows and columns. Each map is a sum of waves whose lengths have the
+    spectrum of a Gaussian.
     """
     phase = cells @ (rng.standard_normal((2, WAVES)) / width)
     waves = np.concatenate([np.cos(phase), np.sin(phase)], axis=1) / np.sqrt(WAVES)

@@ -14,7 +14,7 @@ from heliotrope.geometry import FloatArray
 def write_aims(path: str | Path, plan: AimPlan, joins: FloatArray | None = None) -> None:
     """Write a CSV table of aims, one line per heliostat; defocused heliostats have no aim.
 
-    ``joins``: when each heliostat joins along a ramp, s, (N,), for a further column.
+    ``joins``, s, (N,), is when each heliostat joins along a ramp; it becomes an additional column.
     """
     text = io.StringIO(newline="")
     rows = csv.writer(text, lineterminator="\n")

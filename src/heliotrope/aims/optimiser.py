@@ -1,6 +1,7 @@
 r"""Aims that maximise power under a flux limit, by Lagrangian decomposition.
 
-With $x_{ia}$ = 1 if mirror i takes candidate a, of power $p_{ia}$ and flux $f_{iac}$ in cell c:
+With $x_{ia}$ = 1 if mirror i takes candidate a, which has the power $p_{ia}$ and the flux $f_{iac}$
+in cell c:
 
 $$\max \sum p_{ia} x_{ia}, \qquad \sum f_{iac} x_{ia} \le L_c, \qquad \sum_a x_{ia} \le 1.$$
 
@@ -42,12 +43,12 @@ Step = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Which candidate each mirror takes.
+    """The candidate that each mirror takes.
 
     Attributes
     ----------
     choice
-        Candidate of each mirror, −1: none, (H,).
+        Candidate of each mirror, (H,); −1: none.
     prices
         Multipliers of the cells, W per W/m², (columns, rows).
     flux
@@ -66,14 +67,14 @@ class Choice:
 
     @property
     def gap(self) -> float:
-        """Upper bound on what a better choice could add, as a share of the power."""
+        """Upper bound on the power that a better choice could add, as a fraction of the power."""
         return self.bound / self.power - 1.0 if self.power > 0.0 else np.inf
 
 
 def bound(
     field: Candidates, cap: FloatArray, prices: FloatArray, idle: float = 0.0
 ) -> tuple[float, IntArray]:
-    """Return the dual D(λ) in W and each mirror's best candidate at these prices, (H,)."""
+    """Return the dual D(λ), W, and each mirror's best candidate at these prices, (H,)."""
     net = field.power - field.worth(prices)
     best = net.argmax(axis=1)
     value = net[np.arange(len(net)), best]
@@ -92,7 +93,7 @@ def optimise(
     gap: float = GAP,
     progress: Step | None = None,
 ) -> Choice:
-    """Return the choice with the most power whose flux exceeds the cap nowhere.
+    """Return the choice with the most power whose flux does not exceed the cap in any cell.
 
     Parameters
     ----------
@@ -105,7 +106,7 @@ def optimise(
     keep
         Whether every mirror must send its light to the receiver; the flux may then exceed the cap.
     sweeps
-        Maximum number of sweeps over all mirrors; with 0 the starting choice is only brought under
+        Maximum number of sweeps over all mirrors; if 0, the starting choice is only brought under
         the cap.
     gap
         Gap at which the sweeps end.

@@ -31,7 +31,7 @@ class AimPlan(Value, Framed):
     strategy
         One of `STRATEGIES`.
     light
-        Flux and efficiencies at these aims; its ``aim`` holds them. Defocused heliostats have no
+        Flux and efficiencies at these aims, which are in its ``aim``. Defocused heliostats send no
         light.
     defocused
         Heliostats that are defocused, (N,).
@@ -73,12 +73,12 @@ class AimPlan(Value, Framed):
 
     @property
     def gap(self) -> float:
-        """Upper bound on the power that better aims could add, as a fraction; NaN if none."""
+        """Upper bound on the power that better aims could add, as a fraction; NaN if unknown."""
         return self.scene.choice.gap
 
     @property
     def excess(self) -> float:
-        """Largest ratio of the flux quantile to the limit, minus 1; ≤ 0 if the limit holds."""
+        """Largest ratio of the flux quantile to the limit, minus 1; not above 0 if it holds."""
         return self.scene.excess
 
     @property
@@ -97,7 +97,10 @@ class AimPlan(Value, Framed):
         return self.scene.gain
 
     def deviation(self, wanted: "FluxLimit | npt.ArrayLike") -> float:
-        """Return the RMS difference of the flux from a wanted map of equal mean, over the mean."""
+        """Return the RMS difference between the flux and a wanted map, divided by the mean.
+
+        The wanted map is scaled to the same mean.
+        """
         flux = self.light.flux
         return deviation(flux, FluxLimit.of(wanted).on(*flux.shape))
 
@@ -155,7 +158,7 @@ def plan_aims(
     Parameters
     ----------
     plant
-        As calibrated.
+        The plant, with its calibrated mechanisms.
     time, sun
         Exactly one of the two, as for `heliotrope.optics.field_flux`.
     receiver
@@ -167,14 +170,15 @@ def plan_aims(
     probability
         Probability that the limit holds in all cells at once, 0.5 to 0.9999.
     shared
-        Errors that mirrors share; None: none. Each mirror's own error is ``error`` of the light.
+        Errors that mirrors share; None: there are none. Each mirror's own error is ``error`` of the
+        light.
     keep
         Whether no heliostat may be defocused.
     wanted
-        Wanted flux: a map, or a number for a uniform flux; only the ratios between cells count.
-        None: most power, wherever it is.
+        Wanted flux: a map, or a number for a uniform flux; only the ratios between cells matter.
+        None: the most power, however it is distributed.
     give
-        Share of the power that may be given up for the wanted map, 0 to 0.5.
+        Fraction of the power that may be sacrificed for the wanted map, 0 to 0.5.
     start
         A plan of the same plant and receiver for another sun position, irradiance or limit, from
         which the search begins.
@@ -186,7 +190,7 @@ def plan_aims(
     Raises
     ------
     InputError
-        As `field_flux`, or if no aims hold the limit.
+        As for `field_flux`, or if no aims respect the limit.
     UnknownNameError
         If there is no receiver, option or strategy of that name.
     """

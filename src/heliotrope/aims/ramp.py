@@ -11,12 +11,12 @@ MOST = 2_000
 
 
 def ramp_up(aims: SceneAims, rate: float, step: float = 60.0) -> FloatArray:
-    """Return when each mirror joins the receiver, s after the start, (H,); NaN: it has no aim.
+    """Return when each mirror joins the receiver, s after the start, (H,); NaN if it has no aim.
 
     At the start of step k, counted from 0, mirrors join as long as the flux of no cell exceeds
-    k + 1 times the rise that one step allows; a mirror whose image alone exceeds that waits. In the
-    reverse order they leave along the same ramp: at a shut-down, a time t of the start-up is the
-    last time less t.
+    k + 1 times the rise that one step allows; a mirror whose image alone exceeds this waits. For a
+    shut-down, mirrors leave along the same ramp in reverse order: a start-up time t becomes the
+    last time minus t.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def ramp_up(aims: SceneAims, rate: float, step: float = 60.0) -> FloatArray:
     joins = np.full(count, np.nan)
     joining = ~aims.defocused & (aims.engine.leaving > 0.0)
     turn = (np.arange(count) * 0.6180339887498949) % 1.0
-    # Neighbours one after the other would fill the same cells first.
+    # If neighbours joined one after the other, they would fill the same cells first.
     waiting = [int(row) for row in np.argsort(turn, kind="stable") if joining[row]]
     flux, peak = np.zeros(images.shape[::-1]), float(aims.engine.maps[0].max())
     if peak > MOST * rate * step:

@@ -1,12 +1,12 @@
 """Moves heliostats from their present aims to better ones, a few at a time, within the limit.
 
-Every heliostat that has an aim counts as shining, so that any of them may join at any time. This is
-safe because fewer beams never bring more light to a cell. Each step moves a few heliostats. A
-moving heliostat may be anywhere on its path. A step is therefore taken only if the light of all
-other heliostats, plus the most that each moving beam brings to a cell anywhere on its path, stays
-below the limit less the margin for errors. A cell that is already above this must not get more
-light. The heliostats whose moves relieve the fullest cells most go first. If no move is possible,
-some heliostats rest and return later at other aims.
+Every heliostat that has an aim is treated as if its beam were on the receiver, so that any of them
+may join at any time. This is safe because fewer beams never bring more light to a cell. Each step
+moves a few heliostats. A moving heliostat may be anywhere on its path. A step is therefore taken
+only if the light of all other heliostats, plus the most that each moving beam brings to a cell
+anywhere on its path, stays below the limit less the margin for errors. A cell that is already above
+this level must not get more light. The heliostats whose moves relieve the fullest cells most go
+first. If no move is possible, some heliostats rest and return later at other aims.
 """
 
 from dataclasses import dataclass, replace
@@ -27,9 +27,9 @@ from heliotrope.optics.scene import Scene
 ALIKE = 0.05
 #: Maximum number of positions on a beam's path at which its image is computed; one per beam width.
 PLACES = 9
-#: New aims are adopted if they add this share of power, or if the old aims exceed the limit.
+#: New aims are adopted if they add this fraction of power, or if the old aims exceed the limit.
 BETTER = 5e-3
-#: Excess over the limit that counts as zero, and the share of the limit from which a cell binds.
+#: Excess over the limit that counts as zero, and the fraction of the limit from which a cell binds.
 HOLDS, BINDS = 3e-3, 0.99
 #: Maximum number of heliostats whose moves are examined in one round.
 LOOKED = 400
@@ -38,9 +38,9 @@ THINNER = 0.85
 #: Age at which images are computed anew, s.
 FRESH = 600.0
 
-#: Multiples of the golden ratio less their whole parts spread evenly.
+#: The fractional parts of the multiples of the golden ratio are evenly spread.
 GOLDEN = 0.6180339887498949
-#: Share of the mirrors that rest before it is computed anew which others must.
+#: Fraction of the mirrors that rest before the mirrors that must also rest are computed anew.
 SHED = 0.01
 
 Mask = npt.NDArray[np.bool_]
@@ -63,9 +63,9 @@ class Round:
     at
         Time, s.
     aims
-        Aims that the mirrors have been given, ENU m, (H, 3); NaN: none.
+        Aims assigned to the mirrors, ENU m, (H, 3); NaN: none.
     free
-        Mirrors that may be given new aims, (H,).
+        Mirrors that may be assigned new aims, (H,).
     shining
         Mirrors whose beams are on the receiver, (H,).
     fixed
@@ -115,7 +115,7 @@ class Answer:
     Attributes
     ----------
     moves
-        One after the other.
+        Moves, to be made one after the other.
     safe
         The safe spread: aims from the plant file for as many mirrors as the limit allows, (H, 3).
     flux, above, limit
@@ -126,9 +126,10 @@ class Answer:
     power
         Power of the present aims, W.
     gap
-        Upper bound on what still better aims could add, as a share of the planned power.
+        Upper bound on the power that still better aims could add, as a fraction of the planned
+        power.
     left
-        Mirrors whose aims are not yet the best ones.
+        Mirrors that do not yet have their best aims.
     """
 
     moves: tuple[Move, ...]
@@ -170,7 +171,7 @@ def next_round(now: Round, **light: Any) -> Answer:
     Raises
     ------
     InputError
-        If no aims hold the limit together with the beams that stay.
+        If no aims respect the limit together with the beams that stay.
     """
     rows, columns = surface_in(now.scene).shape
     limit = now.demand.limit.on(rows, columns)
@@ -228,7 +229,7 @@ def steps(
     """
     aimed, goes = _aimed(now.aims), _aimed(target_aims)
     if not aimed.any() and now.ramp is None:
-        # No mirror shines, so all may take their best aims at once.
+        # No beam is on the receiver, so all mirrors may take their best aims at once.
         return ((Move(np.flatnonzero(goes), target_aims[goes]),) if goes.any() else ()), 0
     taken = aimed & ~now.free
     path = _Path(now, target_aims, light)
@@ -281,7 +282,7 @@ class _Path:
         return total
 
     def most(self, row: int, *, shines: bool) -> PathImages:
-        """Return a mirror's image before, its maximum on the path, and its image after."""
+        """Return a mirror's image before the move, the maximum on the path, and the image after."""
         before = self.images.of(row) if self.aimed[row] else np.zeros(self.images.shape[::-1])
         after = self.images.of(row, -1) if self.goes[row] else np.zeros_like(before)
         greatest = np.maximum(before, after)
@@ -321,7 +322,7 @@ class _Walk:
         return moves
 
     def _batch(self, paths: dict[int, PathImages]) -> list[int]:
-        """Return the mirrors that move next; those that relieve the fullest cells come first."""
+        """Return the mirrors that move next; mirrors that relieve the fullest cells come first."""
         fullness = (self._flux / np.maximum(self._cap, 1.0)) ** 8
         gain = {row: float(((after - b) * fullness).sum()) for row, (b, _, after) in paths.items()}
         bound = self._flux.copy()
@@ -349,7 +350,10 @@ class _Walk:
         return stuck[: min(self._now.together, self._now.most - self._moved)]
 
     def relieved(self, rows: Rows) -> list[Move]:
-        """Rest mirrors while cells are above the limit, the most effective first, all at once."""
+        """Rest mirrors, the most effective first, until no cell is above the limit.
+
+        All these mirrors rest in a single move.
+        """
         resting: list[int] = []
         lighting = [int(row) for row in rows]
         while lighting:
@@ -371,7 +375,10 @@ class _Walk:
 
 
 def _best(now: Round, demand: Demand, light: dict[str, Any]) -> SceneAims:
-    """Return the aims of maximum power, starting from this process's earlier aims if they fit."""
+    """Return the aims of maximum power.
+
+    The search starts from this process's earlier aims if they fit the scene.
+    """
     scene = replace(now.scene, dark=~now.free)
     at, start = now.at, None
     if _last:
@@ -387,7 +394,7 @@ def _best(now: Round, demand: Demand, light: dict[str, Any]) -> SceneAims:
 
 
 def _alike(scene: Scene, other: Scene) -> bool:
-    """Return whether two scenes have the same mirrors and receiver; arrays may be copies."""
+    """Return whether two scenes have equal mirrors and receivers; arrays may be copies."""
     first, second = surface_in(scene), surface_in(other)
     return bool(
         first.shape == second.shape
@@ -398,7 +405,7 @@ def _alike(scene: Scene, other: Scene) -> bool:
 
 
 def _safe(now: Round, room: FloatArray, light: dict[str, Any]) -> FloatArray:
-    """Return the plant file's aims of as many free mirrors as hold the limit, (H, 3)."""
+    """Return the plant file's aims for as many free mirrors as the limit allows, (H, 3)."""
     turn = (np.arange(len(now.free)) * GOLDEN) % 1.0
     share = 1.0
     while share > 0.5 / len(now.free):

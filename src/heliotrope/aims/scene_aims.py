@@ -1,4 +1,4 @@
-"""Aims of a scene under a flux limit, by repeated choice and correction with the true flux.
+"""Aims of a scene under a flux limit, found by repeated choice and correction.
 
 The optimiser adds images that were computed once, at a few places, and are shifted by whole rows.
 The engine then computes the flux at the aims that were chosen, and its quantile under pointing
@@ -59,10 +59,10 @@ class Demand:
     keep
         Whether no mirror may be defocused.
     wanted
-        Wanted flux, a map or a number (uniform); only the ratios between cells count. None: most
-        power, wherever it is.
+        Wanted flux, a map or a number (uniform); only the ratios between cells matter. None: the
+        most power, however it is distributed.
     give
-        Share of the power that may be given up for the wanted map, 0 to 0.5.
+        Fraction of the power that may be sacrificed for the wanted map, 0 to 0.5.
     """
 
     limit: FluxLimit
@@ -94,9 +94,9 @@ class SceneAims:
     engine
         Flux at these aims; defocused mirrors are dark.
     field, choice
-        The candidates, and the one that each mirror takes.
+        The candidates, and the choice of a candidate for each mirror.
     aims
-        ENU m, (H, 3); those of defocused mirrors are at half height.
+        Aims, ENU m, (H, 3); the aims of defocused mirrors are at half height.
     defocused
         (H,).
     limit
@@ -146,14 +146,14 @@ def aim_scene(
     progress: Step | None = None,
     **light: Any,
 ) -> SceneAims:
-    """Return the aims of maximum power under a flux limit, or those of another strategy.
+    """Return the aims of maximum power under a flux limit, or the aims of another strategy.
 
     Parameters
     ----------
     scene
         Has one receiver; its aims are ignored.
     demand
-        The limit, and the probability with which it must hold.
+        The limit, and the probability with which the limit must hold.
     strategy
         One of `heliotrope.aims.STRATEGIES`; all but "optimal" ignore the limit.
     start
@@ -167,8 +167,8 @@ def aim_scene(
     Raises
     ------
     InputError
-        If there is no single receiver, no mirror reaches it, a limit leaves no room for the
-        errors, or no aims hold it with every mirror kept.
+        If there is not exactly one receiver, no mirror reaches the receiver, the limit leaves no
+        room for the errors, or no aims respect the limit with every mirror kept.
     """
     rows, columns = surface_in(scene).shape
     limit = demand.limit.on(rows, columns)
@@ -189,10 +189,10 @@ def aim_scene(
 
 
 def _shaped(scene: Scene, best: SceneAims, demand: Demand, light: dict[str, Any]) -> SceneAims:
-    """Return aims whose flux is under the lowest multiple of the wanted map.
+    """Return aims whose flux is under the lowest possible multiple of the wanted map.
 
-    The lowest that keeps the power but for the share that may be given up. The less room there is
-    above the wanted map, the more cells are filled up to it.
+    The multiple is the lowest that keeps the power, apart from the fraction that may be sacrificed.
+    The less room there is above the wanted map, the more cells are filled up to the map.
     """
     assert demand.wanted is not None
     wanted = demand.wanted.on(*best.limit.shape)
@@ -218,7 +218,10 @@ def _shaped(scene: Scene, best: SceneAims, demand: Demand, light: dict[str, Any]
 
 
 def deviation(flux: FloatArray, wanted: FloatArray) -> float:
-    """Return the RMS difference of a flux from a wanted map of equal mean, over the mean."""
+    """Return the RMS difference between a flux and a wanted map, divided by the mean.
+
+    The wanted map is scaled to the same mean.
+    """
     return float(np.sqrt(np.mean((flux / flux.mean() - wanted / wanted.mean()) ** 2)))
 
 
@@ -261,7 +264,7 @@ def _held(
 
 
 def _rank(trial: SceneAims) -> tuple[bool, float]:
-    """Return the sort key of aims: the power if they hold the limit, otherwise the excess."""
+    """Return the sort key of aims: the power if they respect the limit, otherwise the excess."""
     holds = trial.excess <= 0.0
     return holds, trial.engine.powers[0] if holds else -trial.excess
 
@@ -273,7 +276,7 @@ def _part(progress: Step | None, done: int) -> Step | None:
 
 
 def _posed(scene: Scene, aims: FloatArray, off: npt.NDArray[np.bool_] | None) -> Scene:
-    """Return the scene with other aims, and more mirrors dark."""
+    """Return the scene with new aims, and with additional mirrors dark."""
     dark = scene.dark
     if off is not None:
         dark = off if dark is None else dark | off

@@ -1,4 +1,4 @@
-"""Aims without an optimiser, for comparison: the middle, a spread, image-size priority."""
+"""Chooses aims without an optimiser, for comparison: middle, spread, image-size priority."""
 
 from typing import Literal
 
@@ -26,11 +26,12 @@ def choose(field: Candidates, scene: Scene, strategy: Strategy) -> IntArray:
     field
         Candidates of the scene's mirrors.
     scene
-        As the candidates were computed.
+        The scene for which the candidates were computed.
     strategy
-        "middle": all at half height; "spread": mirror after mirror takes the next of its heights;
-        "image-size": the mirror with the widest beam first, each aims where there is least flux so
-        far (SolarPILOT's image size priority: Wagner and Wendelin, *Solar Energy* 171 (2018) 185).
+        "middle": all mirrors aim at half height; "spread": each mirror in turn takes the next of
+        its heights; "image-size": beginning with the widest beam, each mirror aims where the flux
+        so far is lowest (SolarPILOT's image size priority: Wagner and Wendelin, *Solar Energy* 171
+        (2018) 185).
     """
     count, heights = len(field.weight), field.shifts.shape[1]
     middle = heights * (field.images.looks // 2)
@@ -53,7 +54,7 @@ def choose(field: Candidates, scene: Scene, strategy: Strategy) -> IntArray:
 
 
 def _cells(scene: Scene, points: FloatArray) -> IntArray:
-    """Return column and row of the cells of points on the receiver, (..., 2)."""
+    """Return the column and the row of the cells that contain points on the receiver, (..., 2)."""
     surface = surface_in(scene)
     rows, columns = surface.shape
     away = points - surface.center

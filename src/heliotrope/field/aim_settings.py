@@ -20,7 +20,7 @@ class AimSettings:
         "spread": the aims of the plant file, or the receiver's middle; "limit": the aims of maximum
         power that keep the flux under a limit.
     limit
-        Allowable flux, with its margin; None with "spread".
+        Allowable flux, with its margin; None for the strategy "spread".
     map
         Name of the file from which the limit was read; "": the limit is a number.
     probability
@@ -29,8 +29,8 @@ class AimSettings:
         Errors that heliostats share, as standard deviations: rad, s, rad; see
         `heliotrope.aims.SharedErrors`.
     dni
-        The limit must hold at this direct normal irradiance, W/m², even if less is measured,
-        because a cloud may pass at any moment.
+        Direct normal irradiance, W/m², at which the limit must hold, even if less is measured,
+        because a cloud may move away at any moment.
     ramp
         Greatest rise of the flux in a cell, W/m² per s, while the receiver is heated after standby
         or a cloud; 0: no ramp.

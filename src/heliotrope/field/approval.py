@@ -38,7 +38,7 @@ class ApprovalSettings:
 
     @property
     def document(self) -> dict[str, bool | float]:
-        """The settings' table in the plant file, without default values."""
+        """The table of these settings in the plant file, without default values."""
         default = ApprovalSettings()
         table: dict[str, bool | float] = {}
         if self.parameters:

@@ -29,7 +29,7 @@ _PER_SIDE, _STEPS, _FARTHEST = 4, 2000, 20.0
 
 
 class Pinhole(Protocol):
-    """Anything with a frame size (px), a camera matrix (3, 3) and a distortion (5,)."""
+    """Any object with a frame size (px), a camera matrix (3, 3) and a distortion (5,)."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -41,7 +41,7 @@ class Pinhole(Protocol):
 
     @property
     def distortion(self) -> FloatArray:
-        """k1, k2, p1, p2, k3, (5,)."""
+        """Distortion coefficients k1, k2, p1, p2, k3, (5,)."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +57,13 @@ class Camera:
     matrix
         Focal lengths and principal point, px, (3, 3).
     distortion
-        k1, k2, p1, p2, k3, (5,).
+        Distortion coefficients k1, k2, p1, p2, k3, (5,).
     position
-        ENU metres, (3,); None until the camera has been located.
+        Position, ENU, m, (3,); None until the camera has been located.
     R_enu_camera
         Camera axes to ENU, (3, 3): columns right, down, forward; None with ``position``.
     targets
-        Names of the targets in view; empty means any.
+        Names of the targets in view; () means any target.
     source
         Source of frames: a folder, a video, a network address or a device.
     deviation
@@ -118,8 +118,8 @@ def checked_pinhole(
     Raises
     ------
     InputError
-        If a frame's side is outside ``smallest`` to 100,000 px, the matrix is not (3, 3), finite
-        and with focal lengths above 0, or the distortion is not five finite numbers.
+        If a side of the frame is not between ``smallest`` and 100,000 px, the matrix is not (3, 3),
+        finite and with positive focal lengths, or the distortion is not five finite numbers.
     """
     width, height = (int(n) for n in camera.size)
     if not (smallest <= width <= 100_000 and smallest <= height <= 100_000):
@@ -149,7 +149,7 @@ def checked_pose(
     Raises
     ------
     InputError
-        If a shape is wrong, or the rotation is not a right-handed rotation.
+        If a shape is wrong, or the matrix is not a right-handed rotation.
     """
     place, turned = as_vectors(position, f"{name}: position"), as_float(R_enu_camera)
     if place.shape != (3,) or turned.shape != (3, 3):
@@ -161,7 +161,9 @@ def checked_pose(
 
 
 def check_unfolded(name: str, camera: Pinhole) -> None:
-    """Reject a lens whose polynomial folds inside the frame, where a pixel has two rays or none.
+    """Reject a lens whose polynomial folds inside the frame.
+
+    In a fold, a pixel has two rays or none.
 
     From the principal point outwards, along rays to the frame's border, the lens must map
     neighbours to neighbours (the determinant of its Jacobian stays above 0) until it has left the
@@ -170,7 +172,8 @@ def check_unfolded(name: str, camera: Pinhole) -> None:
     Raises
     ------
     InputError
-        If the lens folds before that; the message states the smallest radius at which it folds, px.
+        If the lens folds inside the frame; the message states the smallest radius at which it
+        folds, px.
     """
     if not camera.distortion.any():
         return
@@ -221,9 +224,9 @@ def local_pixels(camera: Pinhole, local: npt.ArrayLike, reach: float = np.inf) -
     Parameters
     ----------
     camera
-        Frame, matrix and distortion.
+        Frame size, matrix and distortion.
     local
-        Metres, in camera axes.
+        Points in camera axes, m.
     reach
         Multiple of the undistorted angle to the frame's farthest corner beyond which points
         are not seen. Far outside the frame the distortion's polynomial may fold back into it;
@@ -263,7 +266,8 @@ def distort(
     plane
         Coordinates without distortion.
     distortion
-        k1, k2, p1, p2, k3 instead of the camera's, each broadcast with the coordinates.
+        Coefficients k1, k2, p1, p2, k3 that replace the camera's, each broadcast with the
+        coordinates.
     """
     place, matrix = as_float(plane), camera.matrix
     x, y = place[..., 0], place[..., 1]
@@ -276,7 +280,7 @@ def distort(
 
 
 def project(camera: Camera, points: npt.ArrayLike) -> FloatArray:
-    """Return the pixels (..., 2) of points, ENU metres (..., 3); NaN behind the camera.
+    """Return the pixels (..., 2) of points in ENU, m, (..., 3); NaN for points behind the camera.
 
     Raises
     ------
@@ -288,7 +292,7 @@ def project(camera: Camera, points: npt.ArrayLike) -> FloatArray:
 
 
 def undistort(camera: Pinhole, pixels: npt.ArrayLike) -> FloatArray:
-    """Return the undistorted normalised coordinates x/z, y/z (..., 2) of pixels (..., 2)."""
+    """Return the undistorted normalised coordinates x/z, y/z of pixels (..., 2), (..., 2)."""
     import cv2
 
     array = as_float(pixels)
@@ -320,9 +324,9 @@ def rays(camera: Camera, pixels: npt.ArrayLike) -> FloatArray:
 
 
 def look_at(position: npt.ArrayLike, point: npt.ArrayLike) -> FloatArray:
-    """Return R_enu_camera (3, 3) of a level camera at ``position`` that looks at ``point``.
+    """Return R_enu_camera, (3, 3), for a level camera at ``position`` that looks at ``point``.
 
-    If it looks straight down or up, the camera's right is east.
+    If the camera looks straight down or up, its right is east.
     """
     forward = normalize(as_float(point) - as_float(position), "line of sight")
     right = np.cross(forward, [0.0, 0.0, 1.0])

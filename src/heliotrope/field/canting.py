@@ -1,9 +1,11 @@
 """Canting: how the facets of a mirror are tilted towards a focus.
 
-The facets of a heliostat lie in the plane of its mirror. SolarPILOT's canting methods:
+The facets of a heliostat lie in the plane of its mirror. SolarPILOT has two canting
+methods:
 
-- on-axis, for one focal length, one for each heliostat, or each heliostat's distance to its aim: to
-  first order in the size of the mirror, the facets are tangent to a paraboloid;
+- on-axis, for one focal length, for one focal length per heliostat, or for each heliostat's
+  distance to its aim: to first order in the size of the mirror, the facets are tangent to a
+  paraboloid;
 - off-axis, for one moment: at that moment, and only then, every facet sends the centre of the sun
   to the aim.
 """
@@ -22,7 +24,7 @@ _ZENITH = np.array([0.0, 0.0, 1.0])
 
 
 def on_axis(center: FloatArray, focal: FloatArray) -> FloatArray:
-    """Return the tilts of facets, (N, F, 2), rad.
+    """Return the on-axis tilts of facets, (N, F, 2), rad.
 
     Parameters
     ----------
@@ -37,15 +39,17 @@ def on_axis(center: FloatArray, focal: FloatArray) -> FloatArray:
 def off_axis(
     center: FloatArray, vertex: FloatArray, normal: FloatArray, sun: FloatArray, aim: FloatArray
 ) -> FloatArray:
-    """Return the tilts for which all facets of a mirror send one sun to its aim, (N, F, 2), rad.
+    """Return the off-axis tilts of facets, (N, F, 2), rad.
+
+    With these tilts, all facets of a mirror send the light from one sun position to its aim.
 
     Parameters
     ----------
     center
         Centres of the facets in the mirrors' planes, m, (N, F, 2).
     vertex, normal
-        Pose of the mirrors when they send that sun to their aims, ENU m and unit vectors, (N, 3).
-        Their axes to the right are level.
+        Pose of the mirrors when they send the light from that sun position to their aims, ENU, m,
+        and unit vectors, (N, 3). The axes of the mirrors to the right are level.
     sun
         Unit vector to the sun, ENU, (3,).
     aim
@@ -61,7 +65,7 @@ def off_axis(
 
 
 def cant(plant: Plant) -> Plant:
-    """Return a plant whose grids of facets are canted as they specify, for each mirror's own aim.
+    """Return a plant with its facet grids canted as they specify, for each mirror's own aim.
 
     Raises
     ------

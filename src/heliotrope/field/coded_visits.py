@@ -1,7 +1,8 @@
 """Settings of coded visits: several heliostats measured at once, identified by their movements.
 
-They belong to a plant, because they depend on its targets, receiver, heliostats and drives. Each
-number is defined once, in this module, with its unit in the plant file, its limits and its meaning.
+These settings belong to a plant, because they depend on its targets, receiver, heliostats and
+drives. Each number is defined once, in this module, with its unit in the plant file, its limits and
+its meaning.
 """
 
 import math
@@ -20,11 +21,11 @@ class Setting:
     text
         Its meaning, for display.
     low, high
-        Its limits, in its unit.
+        Limits of the number, in its unit.
     unit
-        Its unit in the plant file: "mrad", "s" or "suns"; "" for a number or a share.
+        Unit in the plant file: "mrad", "s" or "suns"; "" for a count or a fraction.
     above
-        Whether it must be above ``low``.
+        Whether the number must be above ``low``, not equal to it.
     """
 
     text: str
@@ -35,11 +36,11 @@ class Setting:
 
     @property
     def scale(self) -> float:
-        """Its unit expressed in the program's own units, radians and seconds."""
+        """The unit in terms of the program's own units, radians and seconds."""
         return 1e-3 if self.unit == "mrad" else 1.0
 
     def key(self, name: str) -> str:
-        """Return its key in the plant file."""
+        """Return the key of the setting in the plant file."""
         return f"{name}_{self.unit}" if self.unit else name
 
     def check(self, kind: str, name: str, value: float) -> None:
@@ -58,7 +59,7 @@ class Setting:
 
 
 def _number(default: float, *given: Any, **named: Any) -> Any:
-    """Return a field for a number whose default is in the unit of the plant file; see `Setting`."""
+    """Return a dataclass field whose default is in the unit of the plant file; see `Setting`."""
     setting = Setting(*given, **named)
     value = default * setting.scale if setting.unit else default
     return field(default=value, metadata={"setting": setting})

@@ -1,4 +1,4 @@
-"""The tracking of a heliostat, or of a plant, through one day."""
+"""Tracks a heliostat, or a plant, through one day."""
 
 from dataclasses import dataclass
 from datetime import date, timedelta
@@ -36,9 +36,9 @@ class TrackedDay(Value, Framed):
     sun
         Unit vectors to the apparent sun, ENU, (T, 3).
     aim
-        ENU metres, (3,) or (N, 3).
+        Aims, ENU, m, (3,) or (N, 3).
     path
-        The poses, (T,) of one heliostat or (T, N).
+        The poses, (T,) for one heliostat or (T, N) for a plant.
     """
 
     names: tuple[str, ...]
@@ -101,7 +101,7 @@ def track_day(
     every, min_elevation
         Time step, and lowest apparent elevation of the sun, rad; see `heliotrope.sun.daylight`.
     over_the_top
-        Whether a heliostat may go over the top wherever that saves slews or motion.
+        Whether a heliostat may go over the top wherever this avoids slews or saves motion.
 
     Raises
     ------

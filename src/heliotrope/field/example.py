@@ -1,8 +1,8 @@
 """Our own example plant of 18 heliostats, with finer gears and larger mirrors than the prototype.
 
-Six groups of three heliostats of 2.2 m², south of a tower at Stellenbosch with a target 13 m above
-ground. One of them stands where Malan calibrated his heliostat (30.8 m south, 19.2 m east, pivot
-height 1.2 m). Malan's own plant is `stellenbosch.prototype`.
+It has six groups of three heliostats of 2.2 m² each, south of a tower at Stellenbosch with a target
+13 m above ground. One of them stands where Malan calibrated his heliostat (30.8 m south, 19.2 m
+east, pivot height 1.2 m). Malan's own plant is `stellenbosch.prototype`.
 """
 
 import numpy as np
@@ -65,8 +65,8 @@ def example_plant() -> Plant:
 def azimuth_elevation(position: FloatArray) -> Mechanism:
     """Return azimuth-elevation mechanisms on stepper motors at positions (N, 3).
 
-    200 steps a turn, 16 microsteps, a worm gear of 40:1 behind a gearhead of 60:1: a
-    count is 0.8 µrad of the joint, and 20,000 counts a second turn it by 0.94 °/s.
+    The motors have 200 steps per revolution and 16 microsteps, behind a 60:1 gearhead and a 40:1
+    worm gear: one count turns the joint by 0.8 µrad, and 20,000 counts per second by 0.94 °/s.
     """
     gear = {"microsteps": 16, "speed": 2.0e4}
     azimuth = rotary(200, 2400, min_angle=-np.radians(200.0), max_angle=np.radians(200.0), **gear)
@@ -103,7 +103,7 @@ def roughly_installed(nominal: Mechanism, seed: int = 0, scale: float = 1.0) -> 
 
 
 def _square(center: tuple[float, float, float], size: float) -> FloatArray:
-    """Corners of an upright square that faces south, from the upper left seen from the front."""
+    """Return the corners of an upright square facing south, from the upper left in front view."""
     # Seen by someone looking north, west is to the left.
     half = 0.5 * size
     shifts = np.array([(-half, half), (half, half), (half, -half), (-half, -half)])

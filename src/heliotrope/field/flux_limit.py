@@ -23,9 +23,9 @@ class FluxLimit:
     ----------
     flux
         W/m²: a number, or a map over the receiver, (rows, columns), with the lowest row first and
-        columns ordered like those of its cells; rows and columns may be any number.
+        columns ordered like the columns of its cells; there may be any number of rows and columns.
     margin
-        Share of the flux that is reserved for the model's own error, 0 to 0.5.
+        Fraction of the flux that is reserved for the model's own error, 0 to 0.5.
     """
 
     flux: float | FloatArray
@@ -56,7 +56,7 @@ class FluxLimit:
         return limit if isinstance(limit, FluxLimit) else cls(as_float(limit))
 
     def on(self, rows: int, columns: int) -> FloatArray:
-        """Return the allowable flux of each cell, less the margin, W/m², (rows, columns).
+        """Return the allowable flux of each cell minus the margin, W/m², (rows, columns).
 
         A cell gets the smallest value of the map cells that it overlaps, so that a finer grid never
         allows more.
@@ -88,8 +88,8 @@ def read_limit(path: str | Path, margin: float = 0.0) -> FluxLimit:
     ----------
     path
         File without a header, with the highest row of cells first, as seen in front of the
-        receiver. The columns are ordered like those of the receiver: to the right, or clockwise
-        around a cylinder from the north.
+        receiver. The columns are ordered like the columns of the receiver: to the right, or
+        clockwise around a cylinder from the north.
     margin
         As for `FluxLimit`.
 

@@ -1,8 +1,8 @@
-"""The allowable flux as a table over temperature and velocity, and the fluid's path.
+"""The allowable flux as a table over temperature and velocity, and the path of the fluid.
 
-Allowable flux densities of salt receivers are published as tables: the hotter and the slower the
-fluid in a tube, the less flux its wall endures. The panels of the receiver, in the order of the
-flow, say how hot and how fast the fluid is at each position.
+Allowable flux densities of salt receivers are published as tables: the hotter and slower the fluid
+in a tube, the less flux the tube wall withstands. The panels of the receiver, in flow order,
+specify how hot and how fast the fluid is at each position.
 """
 
 import operator
@@ -56,7 +56,7 @@ class FluxTable:
         FluxLimit(self.flux)
 
     def at(self, temperature: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Return the allowable flux by bilinear interpolation, W/m²; arguments (...,).
+        """Return the allowable flux by bilinear interpolation, W/m², for arguments (...,).
 
         Raises
         ------
@@ -88,13 +88,14 @@ class Panel:
     path
         Name of the flow path.
     begin, end
-        Its edges as shares of the receiver's width, 0 to 1, in the order of the columns.
+        Edges of the panel as fractions of the receiver's width, 0 to 1, in the order of the
+        columns.
     up
         Whether the fluid flows upwards.
     inlet, outlet
         Temperature of the fluid, °C; linear in between.
     velocity
-        Of the fluid, m/s.
+        Velocity of the fluid, m/s.
     """
 
     path: str
@@ -116,8 +117,8 @@ class Panel:
 def limit_of(table: FluxTable, panels: tuple[Panel, ...], margin: float = 0.0) -> FluxLimit:
     """Return the limit that a table sets on a receiver with these panels, as a fine map.
 
-    A cell of the map gets the least allowable flux at its two ends along the flow, of all panels
-    that it overlaps.
+    A cell of the map gets the smallest allowable flux found at its two ends along the flow, over
+    all panels that it overlaps.
 
     Parameters
     ----------
@@ -129,8 +130,8 @@ def limit_of(table: FluxTable, panels: tuple[Panel, ...], margin: float = 0.0) -
     Raises
     ------
     InputError
-        If panels leave a part of the width without a limit or overlap, two panels of a path do not
-        join, or a state of the fluid is outside the table.
+        If panels overlap or leave a part of the width without a limit, if two successive panels of
+        a path do not match, or if a state of the fluid is outside the table.
     """
     _check(panels)
     flux = np.full((_ROWS, _COLUMNS), np.inf)
@@ -147,7 +148,7 @@ def limit_of(table: FluxTable, panels: tuple[Panel, ...], margin: float = 0.0) -
 
 
 def _check(panels: tuple[Panel, ...]) -> None:
-    """Refuse panels that do not cover the width once, or paths with a step in temperature."""
+    """Refuse panels that do not cover the width exactly once, and paths with a temperature step."""
     at = 0.0
     for panel in sorted(panels, key=operator.attrgetter("begin")):
         if abs(panel.begin - at) > 1e-6:
@@ -174,12 +175,14 @@ def _check(panels: tuple[Panel, ...]) -> None:
 
 
 def read_flux_table(path: str | Path) -> FluxTable:
-    """Return the table in a CSV file with the columns `TABLE_COLUMNS`, a line for each pair.
+    """Return the table in a CSV file with the columns `TABLE_COLUMNS`.
+
+    Each line of the file belongs to one pair of temperature and velocity.
 
     Raises
     ------
     FormatError
-        If a column or a pair is missing, or a value cannot be.
+        If a column or a pair is missing, or a value is impossible.
     """
     rows = _rows(path, "a table of allowable fluxes", TABLE_COLUMNS)
     temperature, velocity, flux = (
@@ -211,14 +214,14 @@ def read_flux_table(path: str | Path) -> FluxTable:
 
 
 def read_panels(path: str | Path) -> tuple[Panel, ...]:
-    """Return the panels in a CSV file with the columns `PANEL_COLUMNS`, a line for each panel.
+    """Return the panels in a CSV file with the columns `PANEL_COLUMNS`, one line per panel.
 
-    The column ``flow`` says "up" or "down"; the panels of a path are in the order of the flow.
+    The column ``flow`` contains "up" or "down"; the panels of a path are in flow order.
 
     Raises
     ------
     FormatError
-        If a column is missing, or a value cannot be.
+        If a column is missing, or a value is impossible.
     """
     rows = _rows(path, "a table of panels", PANEL_COLUMNS)
     units = {"begin": "a share of the width", "end": "a share of the width", "inlet_c": "°C",
@@ -240,12 +243,12 @@ def read_panels(path: str | Path) -> tuple[Panel, ...]:
 
 
 def read_table_limit(table: str | Path, panels: str | Path, margin: float = 0.0) -> FluxLimit:
-    """Return the limit that a file of `read_flux_table` sets on the panels of `read_panels`.
+    """Return the limit that a flux table and a panel file set; see the functions that read them.
 
     Raises
     ------
     FormatError, InputError
-        As these functions and `limit_of`.
+        See `read_flux_table`, `read_panels` and `limit_of`.
     """
     return limit_of(read_flux_table(table), read_panels(panels), margin)
 

@@ -18,7 +18,7 @@ from heliotrope.values import Card, Value
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Heliostat(Value, Framed):
-    """One heliostat, as returned by ``plant["P6A"]``; `track` accepts it like a plant of one.
+    """One heliostat, as returned by ``plant["P6A"]``; `track` treats it as a plant of one.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Heliostat(Value, Framed):
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """The name of the heliostat."""
         return self.heliostats.names[0]
 
     @property
@@ -71,12 +71,12 @@ class Heliostat(Value, Framed):
     def with_calibration(self, calibration: Calibrated) -> "Heliostat":
         """Return the heliostat with its own deviations replaced by those of a calibration.
 
-        From a calibration of many heliostats it takes the entry with its name.
+        From a calibration of many heliostats, the entry with this heliostat's name is taken.
 
         Raises
         ------
         InputError
-            If it is not a calibration, or covers several heliostats without names.
+            If the argument is not a calibration, or covers several heliostats without names.
         UnknownNameError
             If the calibration does not include this heliostat, or the mechanism lacks one of its
             parameters.
@@ -120,7 +120,7 @@ class Heliostat(Value, Framed):
 
     @property
     def cluster(self) -> str:
-        """Name of its cluster; empty if it has none."""
+        """Name of its cluster; "" if it has none."""
         return self.heliostats.cluster[0] if self.heliostats.cluster else ""
 
     @property

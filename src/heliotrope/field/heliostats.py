@@ -30,10 +30,11 @@ class Facets(Value):
     center
         Centres of the facets relative to the mirror vertex, m, (N, F, 3).
     half_width, half_height
-        Vectors from the centre of a facet to the midpoints of its right and its upper edge, m, (N,
-        F, 3); their cross product is along the facet normal.
+        Vectors from the centre of a facet to the midpoints of its right edge and its upper edge, m,
+        (N, F, 3); their cross product is along the facet normal.
     grid
-        The grid from which they were made, with its canting; None: each is specified by itself.
+        The grid from which the facets were made, with its canting; None: each facet is specified
+        individually.
     """
 
     center: FloatArray
@@ -64,9 +65,9 @@ class Facets(Value):
         center, half
             Centres and half sizes, right and up, m, (N, F, 2).
         tilt
-            Canting: x and y of the facets' normals, whose z is near 1, rad, (N, F, 2).
+            Canting: x and y components of the facets' normals, whose z is near 1, rad, (N, F, 2).
         grid
-            As the attribute.
+            As for the attribute.
         """
         level = np.zeros_like(center[..., :1])
         normal = normalize(np.concatenate([tilt, level + 1.0], axis=-1), "facets: normal")
@@ -84,13 +85,13 @@ class Facets(Value):
 
     @cached_property
     def half_size(self) -> FloatArray:
-        """Half the width and the height of each facet, m, (N, F, 2)."""
+        """Half the width and half the height of each facet, m, (N, F, 2)."""
         up = np.sum(self.half_height * self.axes[..., 1, :], axis=-1)
         return np.stack([np.linalg.norm(self.half_width, axis=-1), up], axis=-1)
 
     @property
     def tilt(self) -> FloatArray:
-        """Canting: x and y of each facet's normal, whose z is 1, (N, F, 2)."""
+        """Canting: x and y components of each facet's normal, scaled to z = 1, (N, F, 2)."""
         out = self.axes[..., 2, :]
         return as_float(out[..., :2] / out[..., 2:])
 
@@ -122,7 +123,7 @@ class Heliostats(Value, Framed):
     aim
         Aim points in operation, ENU metres, (N, 3); NaN if not specified.
     cluster
-        Name of each heliostat's cluster; empty if it has none.
+        Name of each heliostat's cluster; "" if it has none.
     machines
         Motor limits and rest positions of each heliostat, or () if the plant file does not specify
         them.
@@ -197,7 +198,7 @@ class Heliostats(Value, Framed):
         Raises
         ------
         InputError
-            If one does not; the message names the heliostat and the facet.
+            If a facet does not lie on its mirror; the message names the heliostat and the facet.
         """
         if self.facets is None:
             return
@@ -229,7 +230,7 @@ class Heliostats(Value, Framed):
         return self.labelled()
 
     def labelled(self) -> Labelled:
-        """Return the arrays with their axes; the frame of one heliostat uses them too."""
+        """Return the arrays with their axes; a single heliostat's data frame uses them too."""
         row = ("heliostat",)
         variables = {
             "position": Variable((*row, "axis"), self.position, "m"),
@@ -248,7 +249,7 @@ class Heliostats(Value, Framed):
 
     @property
     def mirror(self) -> str:
-        """Sizes of the mirrors in one phrase: "1.83 × 1.22 m"."""
+        """Sizes of the mirrors in words, such as "1.83 × 1.22 m"."""
         return f"{span(self.width)} × {span(self.height)} m"
 
     def __len__(self) -> int:
@@ -340,12 +341,13 @@ class Heliostats(Value, Framed):
         """Return the heliostats with their own deviations replaced by those of a calibration.
 
         Heliostats that the calibration does not include keep their deviations. A calibration
-        without names must be one for all heliostats, or contain one entry per heliostat.
+        without names must contain a single entry for all heliostats, or one entry per heliostat.
 
         Raises
         ------
         InputError
-            If it is not a calibration, or has neither names nor the right number of entries.
+            If the argument is not a calibration, or has neither names nor the right number of
+            entries.
         UnknownNameError
             If the calibration includes none of these heliostats, or they lack one of its
             parameters.
@@ -353,7 +355,10 @@ class Heliostats(Value, Framed):
         return self.with_rows(calibration, rows_in(calibration, self.names))
 
     def with_rows(self, calibration: Calibrated, rows: npt.NDArray[np.intp]) -> "Heliostats":
-        """Return the heliostats with given entries of a calibration, (N,); −1 keeps their own."""
+        """Return the heliostats with given entries of a calibration, (N,).
+
+        An entry of −1 keeps a heliostat's own deviations.
+        """
         fitted, merged = calibration.parameters, {}
         for name in dict.fromkeys((*self.parameters, *fitted)):
             own = self.parameters.get(name, np.zeros(len(self)))
@@ -363,14 +368,15 @@ class Heliostats(Value, Framed):
 
 
 def rows_in(calibration: Calibrated, names: tuple[str, ...]) -> npt.NDArray[np.intp]:
-    """Return the row of each of N heliostats in a calibration; −1 if it is absent.
+    """Return the index of each of N heliostats in a calibration; −1 if a heliostat is absent.
 
     Raises
     ------
     InputError
-        If it is not a calibration, or has neither names nor as many rows as there are heliostats.
+        If the argument is not a calibration, or has neither names nor as many rows as there are
+        heliostats.
     UnknownNameError
-        If it names none of the heliostats.
+        If the calibration names none of the heliostats.
     """
     check_calibration(calibration)
     count, size = len(names), _size(calibration)

@@ -1,4 +1,4 @@
-"""Plot of a field: an overview, and some heliostats near the tower to scale."""
+"""Plots a field: an overview, and some heliostats near the tower to scale."""
 
 from typing import TYPE_CHECKING
 
@@ -20,7 +20,7 @@ _PART = 14.0
 def picture(plant: Plant) -> "Figure":
     """Return the picture of a plant: heliostats by cluster, targets, cameras, receiver.
 
-    On the right some mirrors near the tower are drawn to scale, each lying flat, with its turning
+    On the right, some mirrors near the tower are drawn to scale, each lying flat in its turning
     circle.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -37,7 +37,7 @@ def picture(plant: Plant) -> "Figure":
 
 
 def _numbers(plant: Plant) -> np.ndarray:
-    """Cluster number of each heliostat."""
+    """Return the cluster number of each heliostat."""
     names = [c for g in plant.groups.values() for c in (g.cluster or ("",) * len(g))]
     order = {name: k for k, name in enumerate(dict.fromkeys(names))}
     return np.array([order[name] for name in names])

@@ -1,4 +1,4 @@
-"""The centre of a generated field: targets with marks, their cameras, receivers."""
+"""The centre of a generated field: targets with marks, the targets' cameras, and receivers."""
 
 import numpy as np
 
@@ -7,9 +7,9 @@ from heliotrope.field.marks import Mark
 from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray, as_float, direction, normalize
 
-#: Size and stroke width of the marks, and their distance from the border, as shares of the side.
+#: Size and stroke width of the marks, and their distance from the border, as fractions of the side.
 _MARK, _STROKE, _INSET = 0.075, 0.015, 0.0375
-#: Share of a frame's shorter side that a target fills.
+#: Fraction of a frame's shorter side that a target fills.
 _FILL = 0.7
 #: Size of a camera's frames, pixels.
 _SIZE = (1600, 1200)

@@ -1,10 +1,10 @@
 """Generated fields: heliostat positions, and whole plants around them.
 
-Four patterns: radial staggered (rings whose heliostats face the gaps of the ring in front), rows in
-two fields north and south of the tower, and from Malan his twin field (figure 3.2) and his
-triangles of six on arcs (figure 5.5). A mirror may face in any direction about its pivot, so two
-heliostats must be further apart than a mirror diagonal plus a clearance; every generator keeps this
-distance, and `nearest_gap` checks it.
+There are four patterns: radial staggered (rings whose heliostats face the gaps of the ring in
+front); rows in two fields north and south of the tower; and, from Malan's thesis, his twin field
+(figure 3.2) and his triangles of six on arcs (figure 5.5). A mirror may face in any direction about
+its pivot, so two heliostats must be further apart than a mirror diagonal plus a clearance; every
+generator keeps this distance, and `nearest_gap` checks it.
 
 Malan's thesis states the size of his plant: 5 MWe, 10,000 heliostats of 5 m² on 100,000 m² of
 ground, and one cluster controller per 32 heliostats. Site, tower, receiver, targets and gears are
@@ -35,13 +35,13 @@ from heliotrope.sun import Site
 CLUSTER = 32
 #: Number of heliostats in a triangle.
 PACK = 6
-#: Share of the ground that the mirrors of Malan's twin field cover.
+#: Fraction of the ground that the mirrors of Malan's twin field cover.
 PACKING = 0.5
 #: Maximum number of heliostats in a layout.
 MOST = 1_000_000
 #: Radius around masts and cameras that is kept free of mirrors, m.
 FREE = 6.0
-#: Steps per turn of a joint; speed of its motor, steps/s.
+#: Steps per revolution of a joint; speed of its motor, steps/s.
 _STEPS, _RATE = 400_000, 8000.0
 #: Final approach from below, steps; angles by which both axes turn away at a defocus, rad;
 #: elevation at stow, and the lowest at which a mirror is turned away there, rad.
@@ -65,7 +65,7 @@ class HeliostatSize:
     width, height
         Size of the mirror, m.
     pivot_height, pivot_offset
-        Height of the axes above ground, and distance of the mirror in front of them, m.
+        Height of the axes above ground, and distance of the mirror in front of the axes, m.
     clearance
         Gap between two mirrors in any pose, m.
     """
@@ -94,7 +94,7 @@ class HeliostatSize:
 
     @property
     def reach(self) -> float:
-        """Least distance between two pivots, m: a diagonal, both offsets, and the clearance."""
+        """Smallest distance between two pivots, m: a diagonal, both offsets, and the clearance."""
         swing = np.hypot(np.hypot(self.width, self.height) / 2.0, self.pivot_offset)
         return float(2.0 * swing + self.clearance)
 
@@ -134,11 +134,14 @@ class Ground:
             )
 
     def elevation(self, radius: float) -> float:
-        """Elevation of the receiver from a distance, rad."""
+        """Elevation of the receiver as seen from a given distance, rad."""
         return float(np.arctan2(self.tower_height, radius))
 
     def bearings(self, radius: float, pitch: float, shift: float = 0.0) -> FloatArray:
-        """Azimuths of positions ``pitch`` m apart on an arc whose middle is free to shift."""
+        """Return the azimuths of positions ``pitch`` m apart on an arc.
+
+        The middle of the arc is free to shift.
+        """
         # The chord is shorter than the arc.
         step = 2.0 * np.arcsin(min(1.0, 0.5 * pitch / radius))
         if self.half_angle >= np.pi - 1e-9:
@@ -150,7 +153,7 @@ class Ground:
         return np.asarray(self.bearing + around[np.abs(around) * step <= self.half_angle] * step)
 
     def clear(self, places: FloatArray) -> np.ndarray:
-        """Return the mask of positions (N, 2) that are outside all free circles, (N,)."""
+        """Return a mask of the positions (N, 2) that are outside all free circles, (N,)."""
         kept = np.ones(len(places), dtype=np.bool_)
         for east, north, radius in self.free:
             kept &= np.hypot(places[:, 0] - east, places[:, 1] - north) > radius
@@ -164,7 +167,7 @@ class Places:
     Attributes
     ----------
     names
-        Unique, (N).
+        Unique names, (N).
     position
         Feet, ENU m, (N, 3).
     """
@@ -181,9 +184,9 @@ def radial_staggered(count: int, mirror: HeliostatSize, ground: Ground) -> Place
 
     A zone begins as densely as mirrors can turn: ``reach`` apart along the ring and √3/2 of that
     between rings (Collado & Guallar 2012, Renewable Energy 46). Azimuths are constant within a
-    zone, so that its heliostats spread out with the radius. Where there is room for two in place of
-    one, a new zone begins. Rings are at least h / (2 sin θ) apart, θ the receiver's elevation: a
-    heliostat then sees over the heliostat two rings in front.
+    zone, so that its heliostats spread out with the radius. Where there is room for two heliostats
+    in place of one, a new zone begins. Rings are at least h / (2 sin θ) apart, where θ is the
+    receiver's elevation, so that a heliostat sees over the heliostat two rings in front.
 
     Names: ring and number, "R012-034".
     """
@@ -220,8 +223,8 @@ def _ring_step(radius: float, zone: float, mirror: HeliostatSize, ground: Ground
 def rows(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
     """Return heliostats in straight east-west rows, in two fields north and south of the tower.
 
-    Each field is twice as wide as it is deep. Rows are ``reach`` apart near the tower and
-    h / sin θ further out, θ the receiver's elevation, so that a heliostat sees over the row in
+    Each field is twice as wide as it is deep. Rows are ``reach`` apart near the tower and h / sin θ
+    further out, where θ is the receiver's elevation, so that a heliostat sees over the row in
     front; every other row is shifted by half a pitch. The bearing and angle of the ground are not
     used.
 
@@ -238,10 +241,10 @@ def rows(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
 def twin_field(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
     """Return Malan's twin field: two equal fields of uniform density on both sides of the tower.
 
-    Mirrors cover the share ``PACKING`` of the ground of a field, his 0.5 (3.2.1), or less where the
-    clearance requires it: 0.47 with the default mirror, 0.5 up to a clearance of 0.19 m. Every
+    Mirrors cover the fraction ``PACKING`` of a field's ground, Malan's 0.5 (3.2.1), or less where
+    the clearance requires it: 0.47 with the default mirror, 0.5 up to a clearance of 0.19 m. Every
     other row is shifted by half a pitch, so that neighbours form equal triangles. A field is twice
-    as wide as it is deep; that, the stagger and the names, those of `rows`, are ours.
+    as wide as it is deep. This proportion, the stagger and the names (as in `rows`) are ours.
     """
     even = np.sqrt(2.0 / np.sqrt(3.0) * mirror.width * mirror.height / PACKING)
     pitch = max(mirror.reach, float(even))
@@ -260,7 +263,7 @@ def _two_fields(count: int, ground: Ground, pitch: float, step: Callable[[float]
     pitch
         Distance between neighbours in a row, m.
     step
-        Returns the distance to the next row from the distance of a row to the tower, m.
+        Function that returns the distance to the next row from a row's distance to the tower, m.
     """
     _check_count(count)
     parts: list[FloatArray] = []
@@ -285,7 +288,10 @@ def _two_fields(count: int, ground: Ground, pitch: float, step: Callable[[float]
 
 
 def _row_length(count: int, nearest: float, pitch: float, step: Callable[[float], float]) -> float:
-    """Return the places of a row that make ``count`` mirrors about twice as wide as deep."""
+    """Return the number of places per row for a field of ``count`` mirrors.
+
+    The field is then about twice as wide as it is deep.
+    """
     north, rows_made = nearest, 0
     while rows_made * 2.0 * (north - nearest) / pitch < count:
         north += step(north)
@@ -297,9 +303,9 @@ def six_packs(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
     """Return Malan's triangles of six mirrors on arcs around the tower.
 
     A triangle has a mirror at each corner and at the middle of each side. On an arc, triangles that
-    point to the tower and away from it alternate, with a footpath between each two. Arcs are
-    separated by a road as wide as the reach of a mirror, or by h / sin θ if that is more (θ the
-    receiver's elevation), so that triangles see over those in front.
+    point to the tower alternate with triangles that point away from it, with a footpath between
+    neighbours. Arcs are separated by a road as wide as the reach of a mirror, or by h / sin θ if
+    that is wider (θ is the receiver's elevation), so that mirrors see over the triangles in front.
 
     Names: triangle and position in it, "P0001A" to "P0001F".
     """
@@ -326,7 +332,7 @@ def six_packs(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
 
 
 def _triangles(around: FloatArray, radius: float, step: float) -> FloatArray:
-    """Triangles at azimuths (n,) on an arc, (n, 6, 2); those with odd numbers are reversed."""
+    """Return triangles at azimuths (n,) on an arc, (n, 6, 2); odd-numbered ones are reversed."""
     depth = 0.5 * np.sqrt(3.0) * step
     # Coordinates to the right of the bearing and outwards, from the middle of the triangle's
     # height.
@@ -348,7 +354,7 @@ def _triangles(around: FloatArray, radius: float, step: float) -> FloatArray:
 
 
 def _central(along: FloatArray, room: int) -> FloatArray:
-    """Return the middle part of a ring, row or arc that has room."""
+    """Return the middle part of a ring, row or arc, as far as there is room."""
     first = max(0, (len(along) - room) // 2)
     return along[first : first + room]
 
@@ -366,14 +372,14 @@ def _places(names: Sequence[str], parts: Sequence[FloatArray]) -> Places:
 
 
 def nearest_gap(position: FloatArray, mirror: HeliostatSize) -> float:
-    """Return the smallest gap between two mirrors in any pose, m; below 0 they can touch.
+    """Return the smallest gap between two mirrors in any pose, m; if negative, they can touch.
 
     Parameters
     ----------
     position
-        Pivots or feet, (N, 3); fewer than two give inf.
+        Pivots or feet, (N, 3); the gap is infinite for fewer than two.
     mirror
-        Common size; its clearance counts as part of the gap.
+        Common size of the heliostats; its clearance counts as part of the gap.
     """
     from scipy.spatial import cKDTree
 
@@ -394,15 +400,15 @@ TWO_SIDED = ("rows", "twin-field")
 
 
 def clusters(count: int, size: int = CLUSTER) -> tuple[str, ...]:
-    """Return the cluster of each heliostat in the order of their positions, from "C001" on."""
+    """Return the cluster of each heliostat, from "C001" on, in the order of positions."""
     return tuple(f"C{1 + i // size:03d}" for i in range(count))
 
 
 def stepped(position: FloatArray, mirror: HeliostatSize) -> Mechanism:
     """Return azimuth-elevation mechanisms on stepper motors at positions (N, 3).
 
-    400,000 steps per turn of a joint (15.7 µrad each), 8000 steps/s: 7.2 °/s. Stops at ±200° of
-    azimuth, where 0 is north, and at -3.6° and 93.6° of elevation.
+    A joint makes 400,000 steps per revolution (15.7 µrad each), at 8000 steps/s or 7.2 °/s. The
+    stops are at ±200° of azimuth, where 0 is north, and at -3.6° and 93.6° of elevation.
     """
     gear = {"microsteps": 4, "speed": _RATE}
     ratio = _STEPS / 800
@@ -419,7 +425,7 @@ def stepped(position: FloatArray, mirror: HeliostatSize) -> Mechanism:
 def stepped_machine(mechanism: Mechanism, receiver: Receiver) -> Machine:
     """Return limits and rest positions of identical azimuth-elevation mechanisms.
 
-    The limits are the drives' stops, the rate is that of the drives, and the acceleration reaches
+    The limits are the drives' stops, the rate is the drives' speed, and the acceleration reaches
     this rate in half a second. At stow the azimuth is midway between its stops and the mirror faces
     up; `unlit_machines` turns the heliostats whose beams would pass the receiver or a target. The
     standby point is beside the receiver, at the height of its centre.
@@ -427,7 +433,7 @@ def stepped_machine(mechanism: Mechanism, receiver: Receiver) -> Machine:
     Parameters
     ----------
     mechanism
-        Nominal, (N,); its drives have a speed and stops.
+        Nominal mechanisms, (N,); their drives have a speed and stops.
     receiver
         Receiver at which the beams aim in operation.
     """
@@ -456,18 +462,19 @@ def unlit_machines(
     """Return the machines with stow positions from which no beam lights anything all year.
 
     A mirror that faces up keeps its stow position, unless some sun position would send its beam to
-    one of the things. It is then turned away from the things, and tilted just far enough that the
-    sun would have to be below the horizon to light them. If even 45° is not enough, the whole group
-    accepts it (`Machine.stow_lights`).
+    one of the ``things``. The mirror is then turned away from them, and tilted just far enough that
+    the sun would have to be below the horizon to light them. If even 45° is not enough, the whole
+    group accepts such light (`Machine.stow_lights`).
 
     Parameters
     ----------
     machines, mechanism
-        Of azimuth-elevation heliostats, N, whose azimuth is clockwise from north.
+        Machines and mechanisms of N azimuth-elevation heliostats whose azimuth is clockwise from
+        north.
     things
         Centre, ENU, m, (3,), and radius, m, of each receiver and target.
     latitude
-        rad, north positive.
+        Latitude, rad, north positive.
     """
     drives, armature = Drive(mechanism.drives.table), mechanism.armature
     stow = np.array([machine.stow for machine in machines])
@@ -490,10 +497,10 @@ def _lights(
     things: Sequence[tuple[FloatArray, float]],
     latitude: float,
 ) -> npt.NDArray[np.bool_]:
-    """Return whether any sun position of the year sends stationary beams to things, (N,).
+    """Return whether, at any sun position of the year, beams at rest hit ``things``, (N,).
 
-    All sun positions from which a beam comes within reach of a thing lie in a cone; the sun may be
-    in this cone if it reaches above the horizon and between the tropics.
+    All sun positions at which a beam comes within the radius of a thing lie in a cone; the sun may
+    be in this cone if it reaches above the horizon and between the tropics.
     """
     normal, vertex = pose
     pole = np.array([0.0, np.cos(latitude), np.sin(latitude)])
@@ -509,16 +516,17 @@ def _lights(
 
 
 def malan_plant(heliostats: int = 10_000) -> Plant:
-    """Return a plant of the size of Malan's: 5 MWe, 10,000 heliostats of 5 m² in 313 clusters.
+    """Return a plant of the size of Malan's: 5 MWe, 10,000 heliostats of 5 m², 313 clusters.
 
-    Triangles of six south of the tower; a cavity 80 m above the pivots; two calibration targets of
-    12 m on masts 45 m east and west of it, clear of the path that beams take up the tower, each
-    with a camera. Site, tower, receiver, targets and gears are ours.
+    It has triangles of six mirrors south of the tower, a cavity 80 m above the pivots, and two
+    calibration targets of 12 m on masts 45 m east and west of the tower, clear of the path that
+    beams take up the tower, each with a camera. Site, tower, receiver, targets and gears are ours.
 
     Parameters
     ----------
     heliostats
-        Number of heliostats; fewer make a smaller plant of the same kind around the same tower.
+        Number of heliostats; with fewer heliostats, the plant is smaller but of the same kind,
+        around the same tower.
     """
     return lay_out("six-packs", heliostats, tower_height=80.0, name="5 MWe")
 
@@ -534,24 +542,24 @@ def lay_out(
 ) -> Plant:
     """Return a whole plant: heliostats, tower, two targets with cameras.
 
-    The field lies on the side of the tower that is away from the equator's sun: south in the
-    southern hemisphere; those of `TWO_SIDED` lie on both.
+    The field lies on the poleward side of the tower (south in the southern hemisphere); fields of
+    the kinds in `TWO_SIDED` lie on both sides.
 
     Parameters
     ----------
     kind
         One of `PATTERNS`.
     heliostats
-        1 to `MOST`.
+        Number of heliostats, 1 to `MOST`.
     mirror
-        Default: 5 m².
+        Size of the heliostats; default: 5 m².
     tower_height
         Height of the receiver above the pivots, m, 20 to 500; default in proportion to the
         field: 80 m for 10,000 heliostats of 5 m², at least 30 m and at most 250 m.
     site
-        Default: in the Northern Cape.
+        Site; default: in the Northern Cape.
     name
-        Name of the plant; default the kind.
+        Name of the plant; default: the kind.
 
     Raises
     ------
@@ -604,7 +612,7 @@ def lay_out(
 
 
 def _tower_height(heliostats: int, mirror: HeliostatSize) -> float:
-    """Return the height of a tower in proportion to the field, m."""
+    """Return the height of the tower in proportion to the field, m."""
     area = heliostats * mirror.width * mirror.height
     return float(np.clip(80.0 * np.sqrt(area / 50_000.0), 30.0, 250.0))
 
@@ -612,7 +620,7 @@ def _tower_height(heliostats: int, mirror: HeliostatSize) -> float:
 def _middle(
     height: float, pivot: float, facing: float, both: bool
 ) -> tuple[tuple[Target, ...], tuple[Camera, ...], Receiver]:
-    """Return targets, cameras and the receiver, in proportion to the height of the tower."""
+    """Return targets, cameras and the receiver, sized in proportion to the tower's height."""
     share = height / 80.0
     aside, up, away = 45.0 * share, 36.0 * share, 150.0 * share
     right = direction(facing - 0.5 * np.pi, 0.0)

@@ -25,11 +25,11 @@ class Mark:
     Attributes
     ----------
     name
-        Unique on its target ("upper_left").
+        Name, unique on its target, such as "upper_left".
     kind
         One of `KINDS`.
     point
-        ENU metres, (3,), of the reference point of the drawing defined in `KINDS`.
+        Position of the reference point of the drawing defined in `KINDS`, ENU, m, (3,).
     size
         Arm length of an L, bar and stem length of a T, side or diameter, m.
     stroke

@@ -1,4 +1,4 @@
-"""Surfaces of triangles, such as the panels of a receiver or the inside of a cavity."""
+"""Surfaces made of triangles, such as the panels of a receiver or the inside of a cavity."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,7 +8,8 @@ import numpy as np
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_vectors
 
-#: Most triangles of a mesh: with 10,000 mirrors, half a minute for one sun position.
+#: Maximum number of triangles of a mesh; with 10,000 mirrors, one sun position then takes half a
+#: minute.
 MOST_FACES = 100_000
 #: Smallest triangle, m².
 _LEAST_AREA = 1e-10
@@ -16,7 +17,7 @@ _LEAST_AREA = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """Triangles, lit from the side from which their vertices run counter-clockwise.
+    """Triangles; the lit side is the one from which their vertices run counterclockwise.
 
     Attributes
     ----------
@@ -76,16 +77,17 @@ def cavity_wall(
     Parameters
     ----------
     radius, height
-        m. The axis passes through the middle of the aperture, in its plane.
+        Radius and height, m. The axis of the cylinder passes through the middle of the aperture, in
+        the aperture's plane.
     opening
         Angle of the sector, half of it on each side of straight back, rad.
     cells
-        Rows and columns of rectangles, each two triangles.
+        Rows and columns of rectangles, each made of two triangles.
 
     Returns
     -------
     TriangleMesh
-        In the axes of the aperture: right and up as seen from its front, and out of it.
+        The wall in the axes of the aperture: right and up as seen from its front, and outwards.
     """
     if not (radius > 0.0 and height > 0.0 and 0.0 < opening <= np.pi):
         raise InputError(

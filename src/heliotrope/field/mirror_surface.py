@@ -1,4 +1,4 @@
-"""What is known of the surface of mirrors beside their size: curvature, errors, grid of facets."""
+"""The known properties of mirror surfaces apart from size: curvature, errors, facet grid."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,8 +23,8 @@ class Canting:
     ----------
     kind
         "none"; "slant": on axis, each mirror for its distance to its aim; "focal": on axis, for a
-        focal length; "off_axis": for one sun position, at which every facet sends the sun to the
-        aim.
+        focal length; "off_axis": for one sun position, at which every facet sends the sunlight to
+        the aim.
     focal
         Focal length of kind "focal", m, (N,).
     sun
@@ -68,9 +68,9 @@ class FacetGrid:
     columns, rows
         1 to 50 each; facets are counted from the lower left, row by row.
     gap
-        Between neighbouring facets, m.
+        Gap between neighbouring facets, m.
     canting
-        Of the facets.
+        Canting of the facets.
     """
 
     columns: int
@@ -84,7 +84,7 @@ class FacetGrid:
         Raises
         ------
         InputError
-            If there are too many facets, or the gaps leave no room for them.
+            If there are too many facets, or the gaps leave no room for facets.
         """
         counts = np.array([self.columns, self.rows])
         if not ((counts >= 1) & (counts <= 50)).all():
@@ -108,20 +108,20 @@ class FacetGrid:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MirrorSurface(Value):
-    """Curvature and errors of the surfaces of N mirrors; None: not known.
+    """Curvature and errors of the surfaces of N mirrors; None: unknown.
 
     Attributes
     ----------
     focal
-        Focal length of the curvature, m: of each mirror, (N,), or of each facet, (N, F). Of a
-        mirror with facets it is that of each facet. Infinity: flat.
+        Focal length of the curvature, m, per mirror, (N,), or per facet, (N, F). If a mirror has
+        facets, a focal length per mirror applies to each of its facets. Infinity: flat.
     slope
         Standard deviation of the surface's normal per axis, rad, (N,) or (N, F).
     reflectivity
-        Of the clean mirrors, (N,).
+        Reflectivity of the clean mirrors, (N,).
     maps
-        Measured deviations of the slope from that surface for each mirror, or None,
-        (F, H, W, 2), rad; see `heliotrope.field.formats.slopes`. ``()``: none are known.
+        For each mirror, the measured deviations of the slope from this surface, (F, H, W, 2), rad,
+        or None; see `heliotrope.field.formats.slopes`. ``()``: no maps are known.
     """
 
     focal: FloatArray | None = None
@@ -133,12 +133,12 @@ class MirrorSurface(Value):
         return card_of_arrays(self)
 
     def check(self, names: Sequence[str], facets: int) -> None:
-        """Check that shapes and numbers fit mirrors of some names with F facets.
+        """Check that shapes and numbers fit the named mirrors, which have F facets.
 
         Raises
         ------
         InputError
-            If they do not; the message names the heliostat, the value and the limit.
+            If they do not fit; the message names the heliostat, the value and the limit.
         """
         count = len(names)
         limits = {

@@ -30,7 +30,7 @@ from heliotrope.sun import Site, check_site
 from heliotrope.values import Card, Value, amount, dots
 
 Surface = TypeVar("Surface", Target, Receiver, Camera)
-#: Positions are one place if they are alike when rounded to this, m.
+#: Positions count as the same place if they are equal when rounded to this, m.
 _ONE_PLACE = 0.01
 
 
@@ -59,7 +59,7 @@ class Plant(Value, Framed):
         Points from which people may see standby beams, ENU, m, (3,), by name.
     joint_visits
         Settings of joint visits, in which several heliostats are measured on one target at once;
-        None: each is calibrated alone.
+        None: each heliostat is calibrated alone.
     receiver_visits
         Settings of receiver visits; None: heliostats are not measured on the receiver.
     timetable
@@ -106,7 +106,7 @@ class Plant(Value, Framed):
             for target in camera.targets:
                 self.target(target)
         if self.receiver_visits is not None:
-            # Both must be known: the camera's place, and a face that it can see.
+            # Two things must be known: the camera's position, and a face that it can see.
             _ = self.receiver(self.receiver_visits.receiver).face
             _ = self.camera(self.receiver_visits.camera).pose
         if self.aims.limit is not None and len(self.receivers) != 1:
@@ -137,7 +137,7 @@ class Plant(Value, Framed):
                 )
 
     def _check_places(self) -> None:
-        """Refuse two heliostats at one place: a row that was copied, or a wrong position."""
+        """Refuse two heliostats at one place, because a row was copied or a position is wrong."""
         cells = np.round(self.position / _ONE_PLACE)
         order = np.lexsort(cells.T)
         same = (np.diff(cells[order], axis=0) == 0.0).all(axis=1)
@@ -270,7 +270,8 @@ class Plant(Value, Framed):
         Raises
         ------
         InputError
-            If it is not a calibration, or has neither names nor the right number of entries.
+            If the argument is not a calibration, or has neither names nor the right number of
+            entries.
         UnknownNameError
             If the calibration includes none of the heliostats, or a kind of mechanism lacks one of
             its parameters.
@@ -288,7 +289,7 @@ class Plant(Value, Framed):
         Raises
         ------
         InputError
-            If the heliostat's group has none.
+            If the heliostat's group has no machine table.
         UnknownNameError
             If there is no heliostat of that name.
         """
@@ -331,7 +332,7 @@ class Plant(Value, Framed):
         Raises
         ------
         InputError
-            If some heliostats have one drive and others two; use the groups one by one instead.
+            If some heliostats have one drive and some have two; use the groups one by one instead.
         """
         tables = [g.calibrated.drives.table for g in self.groups.values()]
         if len({table.shape[-2] for table in tables}) > 1:

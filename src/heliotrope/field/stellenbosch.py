@@ -1,12 +1,13 @@
 """Malan's prototype: the eighteen heliostats on the roof laboratory at Stellenbosch.
 
-From the thesis: three triangular structures of six heliostats, one cluster each (5.2, 5.3); mirrors
-of 0.3 m by 0.3 m; 200-step motors with eighth steps behind a 30:1 worm gear, which gives 48,000
-steps per revolution, 0.13 mrad each (5.1.2); two targets of 2 m by 2 m on an 18 m lattice tower in
-the north-west, about 40 m from the upper target to the middle of the heliostats (6.1), with the
-lower target 13 m above ground (4.3); the heliostat of 6.3, 30.8 m south and 19.2 m east of the
-tower with its pivot 1.2 m above ground; and stow, with the mirror upright and facing north (6.5).
-Beams go to the upper target, which serves as the receiver, or to the lower target for calibration.
+The thesis specifies: three triangular structures of six heliostats, one cluster each (5.2, 5.3);
+mirrors of 0.3 m by 0.3 m; 200-step motors with eighth steps behind a 30:1 worm gear, which results
+in 48,000 steps per revolution, 0.13 mrad each (5.1.2); two targets of 2 m by 2 m on an 18 m lattice
+tower in the north-west, about 40 m from the upper target to the middle of the heliostats (6.1),
+with the lower target 13 m above ground (4.3); the heliostat of 6.3, 30.8 m south and 19.2 m east of
+the tower with its pivot 1.2 m above ground; and stow, with the mirror upright and facing north
+(6.5). Beams go to the upper target, which serves as the receiver, or to the lower target for
+calibration.
 
 The thesis does not state the size of a structure, the positions of the other heliostats, the
 bearing of the targets, the motor speed, the camera position or the latitude; these are our own
@@ -30,18 +31,18 @@ from heliotrope.mechanism.drives import rotary
 from heliotrope.mechanism.machine import Machine, Stepping
 from heliotrope.sun import Site
 
-#: Steps of a motor's turn, microsteps of a step, and turns of the worm to a turn of the joint.
+#: Steps per motor revolution, microsteps per step, and worm revolutions per joint revolution.
 STEPS, MICROSTEPS, WORM = 200, 8, 30
 #: The heliostat of 6.3: m east, north, and up to its pivot.
 _PLACE, _PIVOT_HEIGHT = (19.2, -30.8), 1.2
 #: Side of a mirror and of a target; heights of the targets' centres, m.
 _MIRROR, _TARGET = 0.3, 2.0
 _LOWER, _UPPER = 13.0, 17.0
-#: Distance of neighbouring heliostats of a structure, and of the structures' middles, m.
+#: Distance between neighbouring heliostats of a structure, and between the structures' centres, m.
 _SPACING, _APART = 0.75, 3.0
 #: The camera, m: in front of the lower target, above the ground, and to the right of the target.
-#: From here, no sun of the year above 8° comes nearer than 17° to its line of sight; from the
-#: middle, a winter's sun is behind the target for an hour in the afternoon.
+#: From here, no sun position above 8° comes nearer than 17° to the camera's line of sight in a
+#: year; from the middle, the winter sun is behind the target for an hour in the afternoon.
 _CAMERA = (30.0, 3.0, -20.0)
 #: Steps/s of the motors: 7.5 °/s of the joint.
 _RATE = 1000.0
@@ -83,7 +84,10 @@ def _standing(name: str, height: float, bearing: float) -> Target:
 
 
 def _places(bearing: float) -> FloatArray:
-    """Feet of the heliostats, (18, 3), structure by structure; that of 6.3 is the last one's B."""
+    """Return the feet of the heliostats, (18, 3), structure by structure.
+
+    The heliostat of section 6.3 is B of the last structure.
+    """
     depth = 0.5 * np.sqrt(3.0) * _SPACING
     # A heliostat at each corner and at the middle of each side: right, and away from the tower.
     triangle = np.array(
@@ -112,7 +116,10 @@ def _mechanism(position: FloatArray) -> Mechanism:
 
 
 def _machine(mechanism: Mechanism, receiver: Receiver) -> Machine:
-    """Limits, stow (upright and facing north: both counts are 0), and drivers that rest (6.2)."""
+    """Return the limits, the stow position, and motor drivers that switch off at rest (6.2).
+
+    At stow the mirror is upright and faces north; both step counts are 0.
+    """
     made = layouts.stepped_machine(mechanism, receiver)
     # Elastic cords and the mirror's weight keep the gears on one flank (5.1.3).
     first, second = (replace(axis, backlash=0) for axis in made.axes)

@@ -26,7 +26,7 @@ class Target(Value):
     Attributes
     ----------
     name
-        Unique in the plant.
+        Name, unique in the plant.
     corners
         Upper left, upper right, lower right, lower left as seen from the front (the side that the
         beams come from), ENU metres, (4, 3).
@@ -35,7 +35,7 @@ class Target(Value):
     markers
         Additional known points by name, ENU metres.
     marks
-        Marks painted on the target that let cameras locate it.
+        Marks painted on the target, by which cameras locate the target.
     """
 
     name: str
@@ -99,12 +99,12 @@ class Target(Value):
 
     @property
     def width(self) -> float:
-        """Mean width, m."""
+        """Mean width of the target, m."""
         return float(np.linalg.norm(self._across))
 
     @property
     def height(self) -> float:
-        """Mean height, m."""
+        """Mean height of the target, m."""
         return float(np.linalg.norm(self._up))
 
     @cached_property
@@ -114,7 +114,7 @@ class Target(Value):
 
     @property
     def upside_down(self) -> bool:
-        """Whether the edge that is named upper is the lower one."""
+        """Whether the edge named upper is lower than the other edge."""
         return bool(self._up[2] < 0.0)
 
     @cached_property
@@ -132,7 +132,7 @@ class Target(Value):
         return self.center + np.asarray(plane, dtype=np.float64) @ self.axes
 
     def holds(self, points: npt.ArrayLike, off: float = _DEPTH) -> npt.NDArray[np.bool_]:
-        """Return the mask of ENU points (..., 3) that are on the target; NaN is not on it.
+        """Return a mask of the ENU points (..., 3) that are on the target; NaN counts as off it.
 
         A point is on the target if it is within the border and at most ``off`` m in front of or
         behind the surface.
@@ -149,7 +149,7 @@ class Target(Value):
         o, d = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
         towards = np.asarray(d @ self.normal)
         gap = np.asarray((self.center - o) @ self.normal)
-        # The beam must come from the front, so against the normal.
+        # The beam must come from the front, that is, against the normal.
         length = np.where(towards < 0.0, gap / np.where(towards == 0.0, 1.0, towards), np.nan)
         length = np.where(length > 0.0, length, np.nan)
         return o + length[..., None] * d
@@ -162,7 +162,7 @@ class Receiver(Value):
     Attributes
     ----------
     name
-        Unique in the plant.
+        Name, unique in the plant.
     kind
         "planar", "convex_cylinder", "external_cylinder", "cavity" or "mesh".
     center
@@ -175,9 +175,9 @@ class Receiver(Value):
     corners
         Corners of the aperture in the order of `Target`, (4, 3), if known.
     radius, opening_angle
-        Curvature, m and rad; 0 if flat.
+        Radius of curvature, m, and opening angle, rad; 0 if flat.
     nominal_power
-        Power on it to which readings of its flux refer, W; 0: not known.
+        Power on the receiver to which its flux readings refer, W; 0: unknown.
     mesh
         Surface of a mesh, or inner surface of a cavity, in the axes `frame` about the centre, m.
     """
@@ -243,11 +243,11 @@ class Receiver(Value):
 
     @property
     def frame(self) -> FloatArray:
-        """Axes right and up as seen from the front, and out of it, as rows in ENU, (3, 3)."""
+        """Axes right, up (both as seen from the front) and outwards, as rows in ENU, (3, 3)."""
         return np.concatenate([self.aperture.axes, self.aperture.normal[None]])
 
     def point(self, right: float, up: float) -> FloatArray:
-        """Return a point on the surface, ENU m, (3,), from its position on the unrolled surface.
+        """Return the point, ENU m, (3,), at a position on the unrolled surface.
 
         Parameters
         ----------
@@ -291,7 +291,7 @@ class Receiver(Value):
         Raises
         ------
         InputError
-            If the receiver is of another kind.
+            If the receiver is of a different kind.
         """
         if self.kind != "planar":
             raise InputError(
@@ -302,10 +302,10 @@ class Receiver(Value):
 
     @cached_property
     def aperture(self) -> Target:
-        """The flat rectangle of its width and height about its centre."""
+        """The flat rectangle with the receiver's width and height about its centre."""
         corners = self.corners
         if corners is None:
-            # An aperture that looks straight up or down has no upper edge of its own.
+            # An aperture that faces straight up or down has no natural upper edge.
             level = np.cross([0.0, 0.0, 1.0], self.normal)
             steep = np.linalg.norm(level) < 1e-9
             right = np.array([1.0, 0.0, 0.0]) if steep else normalize(level)
@@ -324,7 +324,7 @@ def point_of(
     aim
         Name of one of the targets, a target or receiver (its centre), or points.
     targets
-        Known by their names.
+        Targets that may be named.
 
     Raises
     ------

@@ -18,7 +18,8 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.files.cells import check_names
 from heliotrope.geometry import FloatArray
 
-#: Length of a day, s; the shortest interval, s; most entries, and most times of day of one.
+#: Length of a day, s; shortest interval, s; maximum number of entries, and of times of day of an
+#: entry.
 DAY, LEAST_INTERVAL, MOST, MOST_TIMES = 86_400.0, 60.0, 100, 96
 
 
@@ -28,7 +29,7 @@ RULES = ("first", "never")
 
 @dataclass(frozen=True)
 class TimetableEntry:
-    """Heliostats to calibrate at times of day, at intervals, or both; or a rule for them.
+    """Heliostats to calibrate at times of day, at intervals, or both; or a rule about them.
 
     Attributes
     ----------
@@ -43,14 +44,14 @@ class TimetableEntry:
     every
         Interval, s, counted from midnight UTC; None: only ``at``.
     rule
-        "" for entries with times; "first": automatic control visits them before others whenever a
-        visit is worthwhile; "never": automatic control does not visit them, only operators do. A
-        rule has neither times nor a target.
+        "" for entries with times; "first": automatic control calibrates these heliostats before all
+        others whenever a visit is worthwhile; "never": only operators calibrate them, automatic
+        control does not. A rule has neither times nor a target.
 
     Raises
     ------
     InputError
-        If it has no heliostat or no time, or a time or the interval is invalid.
+        If the entry has no heliostat or no time, or if a time or the interval is invalid.
     """
 
     name: str
@@ -93,7 +94,7 @@ class TimetableEntry:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> "TimetableEntry":
-        """Return the entry from a document with the keys of the plant file."""
+        """Return the entry in a document that uses the keys of the plant file."""
         return cls(
             document["name"],
             tuple(document["heliostats"]),
@@ -105,7 +106,7 @@ class TimetableEntry:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The entry with the keys of the plant file; values that are not set are left out."""
+        """The entry as a document with the keys of the plant file; unset values are left out."""
         rest: dict[str, Any] = {"target": self.target, "at": list(self.at), "every_s": self.every}
         rest["rule"] = self.rule
         settings = {key: value for key, value in rest.items() if value}
@@ -139,9 +140,9 @@ def check_timetable(
     Raises
     ------
     InputError
-        More than ``MOST`` entries, or two whose names are alike.
+        If there are more than ``MOST`` entries, or if two have the same name.
     UnknownNameError
-        A heliostat or a target that the plant does not have.
+        If an entry names a heliostat or a target that the plant does not have.
     """
     listed = tuple(entries)
     if len(listed) > MOST:

@@ -14,11 +14,11 @@ class Tower:
     Attributes
     ----------
     east, north
-        Place of its axis, m.
+        Position of the axis, ENU, m.
     radius
         m.
     bottom, top
-        Heights of its ends, ENU m.
+        Heights of its two ends, ENU, m.
     """
 
     east: float

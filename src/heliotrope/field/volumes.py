@@ -120,9 +120,10 @@ Volume = Sphere | Box | Cylinder | Prism
 
 
 def around(receiver: Receiver, room: float) -> Volume:
-    """Return a volume that holds a receiver and ``room`` (m) on every side of it.
+    """Return a volume that contains a receiver and a margin ``room``, m, on every side.
 
-    An external cylinder is held by a cylinder, every other aperture by the ball about its centre.
+    An external cylinder is enclosed in a cylinder, every other aperture in a sphere about its
+    centre.
     """
     name = once(f"receiver {receiver.name}")
     name = "the receiver" if name == "receiver" else name
@@ -137,7 +138,7 @@ def around(receiver: Receiver, room: float) -> Volume:
 
 
 def around_target(target: Target, room: float) -> Volume:
-    """Return a ball that holds a target and ``room`` (m) on every side of it."""
+    """Return a sphere that contains a target and a margin ``room``, m, on every side."""
     name = once(f"target {target.name}")
     half = float(np.linalg.norm(target.corners - target.center, axis=1).max())
     return Sphere("the target" if name == "target" else name, target.center, half + room)
@@ -173,7 +174,8 @@ def _shadow(start: FloatArray, end: FloatArray, circle: FloatArray) -> FloatArra
     flat = float(np.hypot(axis[0], axis[1]))
     along = axis[:2] / flat if flat > 0.0 else np.array([1.0, 0.0])
     across = np.array([-along[1], along[0]])
-    # An end is a disc: upright it is a circle, lying down a line across.
+    # An end is a disc: seen from above, it is a circle on an upright cylinder, and a line on a
+    # horizontal one.
     disc = circle[:, :1] * abs(axis[2]) * along + circle[:, 1:] * across
     ahead = circle[:, :1] >= 0.0
     return np.asarray(np.where(ahead, end[:2], start[:2]) + disc)

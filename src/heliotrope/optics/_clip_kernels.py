@@ -1,14 +1,14 @@
 # mypy: disable-error-code="no-untyped-call, untyped-decorator"
 # mypy: allow-untyped-defs
-"""Compiled: which part of each mirror sees the sun and its aim past other mirrors and towers.
+"""Compiled: computes which part of each mirror sees the sun and the aim past other objects.
 
-A mirror is stored as SIZE numbers: its centre, its axes x and y and its normal (3 each), half its
-width and height, its curvature 1 / 2f, and the radius of an enclosing sphere. An occluder is a
-convex polygon. A ray that leaves the mirror at (x, y) has the direction d + D (x, y), where D is
-the derivative of the reflected direction with respect to the position on the curved mirror; D is 0
-for shading. The corners of the occluder are projected along these rays into the mirror plane, and
-the polygons are subtracted from the mirror's rectangle one by one. The remainder is a list of
-convex pieces of any length.
+The objects are other mirrors and towers. A mirror is stored as SIZE numbers: its centre, its axes x
+and y and its normal (3 each), half its width and height, its curvature 1 / 2f, and the radius of an
+enclosing sphere. An occluder is a convex polygon. A ray that leaves the mirror at (x, y) has the
+direction d + D (x, y), where D is the derivative of the reflected direction with respect to the
+position on the curved mirror; D is 0 for shading. The corners of the occluder are projected along
+these rays into the mirror plane, and the polygons are subtracted from the mirror's rectangle one by
+one. The remainder is a list of convex pieces of any length.
 """
 
 import math
@@ -20,17 +20,17 @@ from heliotrope.jit import INLINED, INNER, OPTIONS, plain
 
 #: Numbers of a mirror's row; of a tower's (east, north, radius, bottom, top).
 SIZE, TOWER = 16, 5
-#: Corners of a polygon at most: a tower's top, cut twice.
+#: Maximum number of corners of a polygon: a tower's top, cut twice.
 CORNERS = 32
 #: Corners of a tower's top.
 ROUND = 24
-#: Pieces below this share of the mirror's area are dropped.
+#: Pieces below this fraction of the mirror's area are dropped.
 SPECK = 1e-13
 
 
 @njit(**INNER)
 def cells_of(mirrors, low, step, shape, heads, links, tops):
-    """Sort mirrors into a ground grid, as linked lists per cell: heads, links and highest tops."""
+    """Sort mirrors into a ground grid; return linked lists per cell: heads, links, highest tops."""
     for k in range(len(heads)):
         heads[k] = -1
         tops[k] = -math.inf
@@ -108,10 +108,10 @@ def _along(i, mirrors, ray, reach, slack, grid, near, count):
 
 @njit(**OPTIONS)
 def candidates(rows, mirrors, sun, rays, reaches, slack, grid, spans):
-    """List the mirrors that may shade and block each of ``rows``, and where each part begins.
+    """List the mirrors that may shade or block each of ``rows``, and where each part begins.
 
-    ``spans`` (R + 1, 2) receives the start indices of the shading and of the blocking mirrors; its
-    last row receives the end.
+    ``spans`` (R + 1, 2) receives the start indices of the shading mirrors and of the blocking
+    mirrors; its last row receives the end of the list.
     """
     near, count = np.empty(8 * len(rows) + 64, dtype=np.int64), plain(0)
     # Shadows are no longer than the field.
@@ -129,7 +129,7 @@ def candidates(rows, mirrors, sun, rays, reaches, slack, grid, spans):
 
 @njit(**INLINED)
 def _cut(corners, m, into, axis_x, axis_y, axis_z, offset):
-    """Clip a polygon in space to axis · p ≤ offset; return its number of corners."""
+    """Clip a polygon in space to axis · p ≤ offset; return the new number of corners."""
     count = 0
     for k in range(m):
         k2 = k + 1 if k + 1 < m else 0
@@ -151,7 +151,9 @@ def _cut(corners, m, into, axis_x, axis_y, axis_z, offset):
 
 @njit(**INNER)
 def _carry(i, mirrors, ray, bend, reach, corners, m, spare, polygon):
-    """Project a polygon, ENU relative to mirror i, into its plane; 0 corners if it hides nothing.
+    """Project a polygon, ENU relative to mirror i, into the plane of this mirror.
+
+    A polygon that hides nothing gets 0 corners.
 
     ``bend`` is D in the mirror's axes, (3, 2).
     """
@@ -228,7 +230,7 @@ def _mirror_corners(i, j, mirrors, corners):
 
 @njit(**INNER)
 def _tower_corners(i, tower, mirrors, ray, part, corners):
-    """Corners of a tower's outline across the ray (part 0) or of its top (part 1)."""
+    """Compute the corners of a tower's outline across the ray (part 0) or of its top (part 1)."""
     x, y = tower[0] - mirrors[i, 0], tower[1] - mirrors[i, 1]
     bottom, top = tower[3] - mirrors[i, 2], tower[4] - mirrors[i, 2]
     if part == 1:
@@ -253,7 +255,7 @@ def _tower_corners(i, tower, mirrors, ray, part, corners):
 
 @njit(**INLINED)
 def _beside_tower(i, tower, mirrors, ray, reach):
-    """Whether a tower is away from the rays of mirror i."""
+    """Whether a tower lies entirely beside the rays of mirror i."""
     x, y = tower[0] - mirrors[i, 0], tower[1] - mirrors[i, 1]
     flat = math.sqrt(ray[0] ** 2 + ray[1] ** 2)
     room = mirrors[i, 15] + tower[2]
@@ -270,7 +272,7 @@ def _beside_tower(i, tower, mirrors, ray, reach):
 
 @njit(**INNER)
 def bend_of(row, sun, bend):
-    """D of a curved mirror, in its axes: r = 2 (n·s) n − s, dn = −(x, y) / 2f."""
+    """Compute D of a curved mirror, in its axes: r = 2 (n·s) n − s, dn = −(x, y) / 2f."""
     sx = sun[0] * row[3] + sun[1] * row[4] + sun[2] * row[5]
     sy = sun[0] * row[6] + sun[1] * row[7] + sun[2] * row[8]
     sz = sun[0] * row[9] + sun[1] * row[10] + sun[2] * row[11]
@@ -282,7 +284,7 @@ def bend_of(row, sun, bend):
 
 @njit(**INNER)
 def outlines(i, near, mirrors, towers, ray, bend, reach, work):
-    """Collect the polygons that hide a part of mirror i; return them, their corners and number.
+    """Collect the polygons that hide a part of mirror i; return them, their corners, their number.
 
     ``near`` lists the mirrors. ``work`` holds two lists of corners.
     """
@@ -351,7 +353,7 @@ def _area(points, m):
 
 @njit(**INLINED)
 def _apart(points, m, polygon, n):
-    """Whether the boxes of two polygons do not overlap."""
+    """Whether the bounding boxes of two polygons do not overlap."""
     for c in range(2):
         low, high = points[0, c], points[0, c]
         for k in range(1, m):
@@ -367,7 +369,7 @@ def _apart(points, m, polygon, n):
 
 @njit(**INNER)
 def _subtract(points, begins, pieces, polygon, n, speck, into, starts, one, two):
-    """Subtract a convex polygon from convex pieces; return the number of new pieces."""
+    """Subtract a convex polygon from convex pieces; return the number of pieces that remain."""
     total = 0
     for k in range(pieces):
         m = begins[k + 1] - begins[k]
@@ -405,10 +407,12 @@ def _subtract(points, begins, pieces, polygon, n, speck, into, starts, one, two)
 
 @njit(**INNER)
 def left_of(x0, x1, y0, y1, polygons, sizes, count, state):
-    """Subtract polygons from a rectangle; return the state, whose first two arrays list the pieces.
+    """Subtract polygons from a rectangle; return the state.
 
-    ``state``: corners and start indices of the pieces, their number, and the same as output
-    buffers.
+    The first two arrays of the state list the pieces.
+
+    ``state`` contains the corners and start indices of the pieces, their number, and output buffers
+    of the same form.
     """
     points, begins, pieces, into, starts, one, two = state
     points[0, 0], points[0, 1], points[1, 0], points[1, 1] = x0, y0, x1, y0
@@ -437,7 +441,7 @@ def left_of(x0, x1, y0, y1, polygons, sizes, count, state):
 
 @njit(**INNER)
 def new_state():
-    """Buffers for `left_of`; they grow as needed."""
+    """Create the buffers for `left_of`, which grow as needed."""
     return (
         np.empty((256, 2)), np.empty(64, dtype=np.int64), plain(0),
         np.empty((256, 2)), np.empty(64, dtype=np.int64), np.empty((256, 2)), np.empty((256, 2)),
@@ -480,7 +484,7 @@ def whole(x, y, a, b, into):
 
 @njit(**INNER)
 def part_of(i, f, table, kind, split, row):
-    """Middle and half sides of part f of mirror i: a facet, or one of its equal divisions."""
+    """Return the middle and the half sides of part f of mirror i: a facet or an equal division."""
     if len(table):
         cell = table[kind[i], f]
         return cell[0], cell[1], cell[2], cell[3]
@@ -493,9 +497,10 @@ def part_of(i, f, table, kind, split, row):
 def clip(first, last, rows, mirrors, towers, sun, rays, reaches, near, spans, parts, out):
     """Clip mirrors ``rows[first:last]``; see `Lit` for what is written.
 
-    ``spans`` (H, 3): where the list ``near`` of mirrors that may shade it begins, that of those
-    that may block it, and its end. ``parts``: facets (K, F, 4), kind (H,), divisions (H, 2) and the
-    place of each mirror's parts (H + 1,). ``out``: shares (H, 3) and moments of the parts (P, 6).
+    ``spans`` (H, 3): for each mirror, where the shading candidates and the blocking candidates
+    begin in the list ``near``, and where they end. ``parts``: facets (K, F, 4), kind (H,),
+    divisions (H, 2) and the start index of each mirror's parts (H + 1,). ``out``: shares (H, 3) and
+    moments of the parts (P, 6).
     """
     table, kind, split, begin = parts
     shares, moments = out
@@ -552,7 +557,7 @@ def clip(first, last, rows, mirrors, towers, sun, rays, reaches, near, spans, pa
 
 @njit(**OPTIONS)
 def pieces_of(i, mirrors, towers, sun, rays, reaches, near, spans):
-    """Return the convex pieces of the lit part of one mirror: corners and start indices."""
+    """Return the convex pieces of the lit part of one mirror, as corners and start indices."""
     work, straight, bend = (
         (np.empty((CORNERS, 3)), np.empty((CORNERS, 3))), np.zeros((3, 2)), np.zeros((3, 2)),
     )  # fmt: skip

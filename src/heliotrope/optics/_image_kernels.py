@@ -26,9 +26,10 @@ from heliotrope.optics._clip_kernels import part_of
 IMAGE = 6
 #: Exponent beyond which a Gaussian is left out: 1e-7 of its peak.
 DEEP = 16.0
-#: Parts whose images differ in place by less than this share of the blur are merged.
+#: Parts whose image positions differ by less than this fraction of the blur are merged.
 CLOSE = 0.7
-#: Exponent beyond which the sum of a Gaussian's values at cells counts as exact: to 1e-4.
+#: Exponent beyond which the sum of a Gaussian's values at cells is taken to be exact; the error is
+#: 1e-4.
 WIDE = 10.0
 FLAT, ROUND = 0, 1
 _FAST = {**OPTIONS, "fastmath": {"contract", "nsz", "arcp", "nnan"}}
@@ -51,7 +52,7 @@ def _exp(x):
 
 @njit(**INNER)
 def _ray(row, sun, ray, axes):
-    """Compute the central ray, and the axes right and up across it as seen from the mirror."""
+    """Compute the central ray, and the axes right and up across it, as seen from the mirror."""
     nx, ny, nz = row[9], row[10], row[11]
     c = 2.0 * (nx * sun[0] + ny * sun[1] + nz * sun[2])
     ray[0], ray[1], ray[2] = c * nx - sun[0], c * ny - sun[1], c * nz - sun[2]
@@ -73,25 +74,28 @@ def _dot(a, b):
 
 @njit(**INLINED)
 def _row(a, table, k):
-    """Scalar product with a row of a table, without creating a view, which would be slower."""
+    """Return the scalar product with a row of a table.
+
+    No view is created, because that would be slower.
+    """
     return a[0] * table[k, 0] + a[1] * table[k, 1] + a[2] * table[k, 2]
 
 
 @njit(**INLINED)
 def _of(a, row, k):
-    """Scalar product of a vector, or of a row of two axes, with three numbers of a row."""
+    """Return the scalar product of a vector (or a row of two axes) with three numbers of a row."""
     return a[0] * row[k] + a[1] * row[k + 1] + a[2] * row[k + 2]
 
 
 @njit(**INLINED)
 def _axis(axes, e, row, k):
-    """Scalar product of an axis with three numbers of a row."""
+    """Return the scalar product of an axis with three numbers of a row."""
     return axes[e, 0] * row[k] + axes[e, 1] * row[k + 1] + axes[e, 2] * row[k + 2]
 
 
 @njit(**INNER)
 def _turn(row, sun, cosine, axes, into):
-    """Derivative of the ray's position (2) by a tilt of the normal (2), at distance 1."""
+    """Compute how a tilt of the normal (2) displaces the ray (2), at distance 1."""
     for j in range(2):
         k = 3 + 3 * j
         along = _of(sun, row, k)
@@ -101,7 +105,7 @@ def _turn(row, sun, cosine, axes, into):
 
 @njit(**INNER)
 def _blur(row, sun, cosine, axes, slope, pointing, turn):
-    """Variances (uu, uv, vv) of the beam direction due to slope and calibration errors, rad²."""
+    """Covariance (uu, uv, vv) of the beam direction due to slope and calibration errors, rad²."""
     _turn(row, sun, cosine, axes, turn)
     s = slope * slope
     uu = s * (turn[0, 0] ** 2 + turn[0, 1] ** 2) + pointing[0, 0]
@@ -112,7 +116,10 @@ def _blur(row, sun, cosine, axes, slope, pointing, turn):
 
 @njit(**INNER)
 def _spread(turn, axes, row, t, curve, into):
-    """Compute A: derivative of the ray's position (2) by that on the part (2), at distance t."""
+    """Compute A, the derivative of the ray's position with respect to that on the part, (2, 2).
+
+    The ray's position is taken at distance t.
+    """
     for j in range(2):
         for e in range(2):
             into[e, j] = _axis(axes, e, row, 3 + 3 * j) - t * curve * turn[e, j]
@@ -120,7 +127,10 @@ def _spread(turn, axes, row, t, curve, into):
 
 @njit(**INNER)
 def _place(row, sun, ray, axes, t, x, y, tilt_x, tilt_y, into):
-    """Compute where the ray from (x, y) with a tilted normal meets the plane at t; its cosine."""
+    """Compute where the ray from (x, y) with a tilted normal meets the plane at t.
+
+    Also compute the cosine of the ray.
+    """
     nx = row[9] + tilt_x * row[3] + tilt_y * row[6]
     ny = row[10] + tilt_x * row[4] + tilt_y * row[7]
     nz = row[11] + tilt_x * row[5] + tilt_y * row[8]
@@ -138,7 +148,7 @@ def _place(row, sun, ray, axes, t, x, y, tilt_x, tilt_y, into):
 
 @njit(**INNER)
 def _images(i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, images, work):
-    """Compute the merged images of mirror i's parts; return their number and the area of light."""
+    """Compute the merged images of mirror i's parts; return their number and the light's area."""
     table, kind, split, begin = parts
     turn, spread, place = work
     _turn(row, sun, cosine, axes, turn)
@@ -201,7 +211,7 @@ def _images(i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, 
 
 @njit(**INNER)
 def _distance(row, ray, shape):
-    """Distance along the ray to the surface, or to its closest approach; 0 if there is none."""
+    """Distance along the ray to the surface, or to the closest approach; 0 if there is neither."""
     kind, middle, axis, normal, radius = shape
     x, y, z = middle[0] - row[0], middle[1] - row[1], middle[2] - row[2]
     if kind == FLAT:
@@ -229,7 +239,7 @@ def _width(axes, e, wides, k):
 
 @njit(**INNER)
 def _columns(row, ray, axes, t, shape, columns, seen):
-    """Find the visible columns: index, position (2), step along it (2), width (2), weight."""
+    """Find the visible columns: index, position (2), step along each (2), width (2), weight."""
     kind, middle, axis, normal, radius = shape
     bases, wides, means, edges, angles = columns
     ups = (_row(axis, axes, 0), _row(axis, axes, 1))
@@ -282,8 +292,8 @@ def _columns(row, ray, axes, t, shape, columns, seen):
 def _march(z, step, count, rows, local, room):
     """Add the prepared Gaussians from a height z to both ends of the rows that they reach.
 
-    From row to row the exponential of a square needs two products: by its ratio, and by the ratio
-    of ratios.
+    From row to row, the exponential of a square needs two multiplications: one by the ratio of
+    successive values, and one that updates this ratio.
     """
     value, ratio, shrink, up, down, _ = room
     (begin, start, end), most = rows, 0.0
@@ -327,10 +337,10 @@ def _march(z, step, count, rows, local, room):
 
 @njit(**INNER)
 def _comb(variance, place):
-    """Sum of a Gaussian's values at integers, by Poisson's formula; 1 if it is wide.
+    """Return the sum of a Gaussian's values at integers, by Poisson's formula; 1 if it is wide.
 
-    ``variance`` is that of the Gaussian; the position is that of the Gaussian relative to an
-    integer, or the reverse.
+    ``variance`` is the variance of the Gaussian. The position is that of the Gaussian relative to
+    an integer, or of the integer relative to the Gaussian.
     """
     depth = 2.0 * math.pi * math.pi * variance
     if depth > WIDE:
@@ -372,7 +382,7 @@ def _conserve(uu, uv, vv, u, v, visible, count, low, step, room):
 
 @njit(**_FAST)
 def _gauss(power, u, v, uu, uv, vv, seen, count, low, step, rows, local, room):
-    """Add one Gaussian to the visible cells; returns the first and the last row that it reaches."""
+    """Add one Gaussian to the visible cells; return the first and the last row that it reaches."""
     value, ratio, shrink, up, down, peak = room
     box = step * step / 12.0
     power /= 2.0 * math.pi
@@ -443,9 +453,9 @@ def cast(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts, 
     """Add the images of mirrors ``rows[first:last]`` to the flux of a surface in columns.
 
     ``light`` (H,): power per area across the light, W/m². ``sums``: weights and variances of the
-    sun's Gaussians, rad². ``grid``: lowest row, step and number of rows, and area of a cell.
-    ``flux`` (rows, columns) in W/m²; ``out`` (H, 2) gets the power that leaves each mirror and the
-    power on the surface.
+    sun's Gaussians, rad². ``grid``: lowest row, row step, number of rows, and cell area. ``flux``
+    (rows, columns) in W/m²; ``out`` (H, 2) gets the power that leaves each mirror and the power on
+    the surface.
     """
     weights, variances = sums
     low, step, number, area = grid
@@ -505,10 +515,11 @@ def cast_cells(first, last, rows, mirrors, sun, light, slopes, pointing, sums, p
                moments, middle, cells, hidden, group, aperture, sign, flux, out):  # fmt: skip
     """Add the images of mirrors ``rows[first:last]`` to the flux of cells of any shape.
 
-    ``cells`` (C, 16): centre, normal, area and second moments (9) of each. ``hidden`` (D, C): cells
-    that others hide as seen from direction D, which is ``group`` (H,) of each mirror. ``aperture``:
-    centre, right and up (3 each) and half sizes of a rectangle that the light must pass; empty if
-    there is none. ``flux`` (C,) in W/m²; ``out`` (H, 2) as `cast`.
+    ``cells`` (C, 16): centre, normal, area and second moments (9) of each cell. ``hidden`` (D, C):
+    cells that other cells hide as seen from each of D directions; ``group`` (H,) is the direction
+    of each mirror. ``aperture``: centre, right and up (3 each) and half sizes of a rectangle that
+    the light must pass; empty if there is none. ``flux`` (C,) in W/m²; ``out`` (H, 2) is as in
+    `cast`.
     """
     weights, variances = sums
     ray, axes = np.empty(3), np.empty((2, 3))
@@ -574,7 +585,7 @@ def cast_cells(first, last, rows, mirrors, sun, light, slopes, pointing, sums, p
 
 @njit(**INNER)
 def _own(cell, axes, scale):
-    """Second moments of a cell across the ray."""
+    """Compute the second moments of a cell across the ray."""
     form = (0.0, 0.0, 0.0)
     for p in range(3):
         for q in range(3):
@@ -589,7 +600,9 @@ def _own(cell, axes, scale):
 
 @njit(**INNER)
 def _passes(aperture, row, x, y, z):
-    """Fraction of the rays from a mirror to a point (relative to it) that pass the aperture.
+    """Return the fraction of the rays from a mirror to a point that pass the aperture.
+
+    The point is relative to the mirror.
 
     The rays come from the whole mirror, so the aperture's edge is blurred.
     """
@@ -631,7 +644,7 @@ def hide(first, last, ways, cells, corners, hidden):
 
 @njit(**INNER)
 def _meets(cell, way, triangle):
-    """Whether the ray from a cell against the light meets a triangle (Möller and Trumbore)."""
+    """Whether the ray from a cell, against the light, meets a triangle (Möller and Trumbore)."""
     a, b = triangle[1] - triangle[0], triangle[2] - triangle[0]
     x, y, z = -way[0], -way[1], -way[2]
     px, py, pz = y * b[2] - z * b[1], z * b[0] - x * b[2], x * b[1] - y * b[0]

@@ -31,7 +31,7 @@ SPHERE, BOX, CYLINDER, PRISM = range(4)
 SIZE = 10
 #: A beam closer to a volume than this (m) counts as inside it.
 TOUCH = 1e-3
-#: Steps of one march; where they run out the beam counts as in the volume.
+#: Maximum number of steps of one march; if they run out, the beam counts as in the volume.
 STEPS = 2000
 
 
@@ -58,14 +58,14 @@ def distance_to(row, corners, p):
 
 @njit(**INLINED)
 def _extruded(flat, along):
-    """Distance from a solid whose section is ``flat`` away and whose ends are ``along`` away."""
+    """Distance from a solid whose cross-section is ``flat`` away and whose ends ``along`` away."""
     outside = math.sqrt(max(flat, 0.0) ** 2 + max(along, 0.0) ** 2)
     return outside + min(max(flat, along), 0.0)
 
 
 @njit(**INNER)
 def _polygon(corners, first, last, x, y):
-    """Signed distance of (x, y) from a polygon, negative inside (an odd number of crossings)."""
+    """Signed distance of (x, y) from a polygon; negative inside (odd number of crossings)."""
     best, inside = math.inf, False
     for i in range(first, last):
         j = i - 1 if i > first else last - 1
@@ -80,7 +80,7 @@ def _polygon(corners, first, last, x, y):
 
 @njit(**OPTIONS)
 def distances(table, corners, points, out):
-    """Signed distances of points (P, 3) from volumes (V, SIZE) into out (P, V)."""
+    """Write the signed distances of points (P, 3) from volumes (V, SIZE) into ``out`` (P, V)."""
     for i in range(len(points)):
         p = (points[i, 0], points[i, 1], points[i, 2])
         for v in range(len(table)):
@@ -94,7 +94,7 @@ def _radius(t, radius, near, spread):
 
 @njit(**INLINED)
 def apart(row, o, d, reach, radius, near, spread):
-    """Whether the beam certainly misses the sphere around the volume.
+    """Whether the beam certainly misses the sphere that encloses the volume.
 
     At u from its nearest point the ray is √(h² + u²) from the centre and the beam's radius
     has grown by at most k u; √(h² + u²) − k u is at least h √(1 − k²).
@@ -111,7 +111,7 @@ def apart(row, o, d, reach, radius, near, spread):
 
 @njit(**INLINED)
 def contact(row, corners, o, d, reach, radius, near, spread):
-    """Distance along the ray at which the beam first touches the volume, m; −1 if never."""
+    """Distance along the ray at which the beam first touches the volume, m; −1 if it never does."""
     if apart(row, o, d, reach, radius, near, spread):
         return -1.0
     gain = 1.0 / (1.0 + radius * near + spread)
@@ -128,7 +128,7 @@ def contact(row, corners, o, d, reach, radius, near, spread):
 
 @njit(**INLINED)
 def last_contact(row, corners, o, d, first, reach, radius, near, spread):
-    """Distance along the ray at which the beam last touches the volume, from ``first`` on, m."""
+    """Distance along the ray, m, from ``first`` on, at which the beam last touches the volume."""
     gain = 1.0 / (1.0 + radius * near + spread)
     t = reach
     for _ in range(STEPS):
@@ -143,7 +143,7 @@ def last_contact(row, corners, o, d, first, reach, radius, near, spread):
 
 @njit(**OPTIONS)
 def enter(table, corners, origin, direction, reach, radius, near, spread, first, last):
-    """First and last contact, m, of beams (N) with volumes (V) into (N, V); NaN if none."""
+    """Compute the first and the last contact of N beams with V volumes, m, (N, V); NaN if none."""
     for i in range(len(origin)):
         o = (origin[i, 0], origin[i, 1], origin[i, 2])
         d = (direction[i, 0], direction[i, 1], direction[i, 2])
@@ -160,7 +160,7 @@ def enter(table, corners, origin, direction, reach, radius, near, spread, first,
 
 @njit(**INLINED)
 def _pose(a, angle_1, angle_2):
-    """Normal and vertex of an armature (18) at its joint angles."""
+    """Compute the normal and the vertex of an armature (18) at its joint angles."""
     axis_1, axis_2 = (a[0], a[1], a[2]), (a[6], a[7], a[8])
     o1, o2 = (a[3], a[4], a[5]), (a[9], a[10], a[11])
     m, n = (a[12], a[13], a[14]), (a[15], a[16], a[17])
@@ -172,7 +172,7 @@ def _pose(a, angle_1, angle_2):
 
 @njit(**INLINED)
 def _levers(a):
-    """Largest displacement of the vertex per radian of each joint, m."""
+    """Compute the largest displacement of the vertex per radian of each joint, m."""
     axis_1, axis_2 = (a[0], a[1], a[2]), (a[6], a[7], a[8])
     o1, o2, m = (a[3], a[4], a[5]), (a[9], a[10], a[11]), (a[12], a[13], a[14])
     elbow, arm = minus(o2, o1), minus(m, o2)
@@ -181,17 +181,17 @@ def _levers(a):
 
 @njit(**INNER)
 def _move(row, corners, a, path, sun, reach, radius, near, spread, resolution, entry):
-    """Where along the path (K, 2) of joint angles a beam first enters the volume.
+    """Find where, along a path (K, 2) of joint angles, a beam first enters the volume.
 
     Over a span of the path whose joints rotate by at most δ₁ and δ₂ from its middle, the normal
     rotates by at most δ₁ + δ₂, the beam by at most twice that, and the vertex moves by at most the
     levers times δ. If a beam widened by these amounts is clear at the middle, the beam is clear
     over the whole span. Otherwise the span is halved, down to a beam rotation of ``resolution``; a
-    span that cannot be proven clear there counts as an entry.
+    span that still cannot be proven clear counts as an entry.
 
-    Writes into ``entry``: index of the path's corner plus share of the leg up to which it is
-    clear, distance along the beam, m, origin and direction in the pose just after. Returns the
-    poses that were tried, negative at an entry.
+    Writes into ``entry``: the index of the path's corner plus the fraction of the leg up to which
+    the path is clear; the distance along the beam, m; and the beam's origin and direction in the
+    pose just after. Returns the number of poses that were tried, negative if the beam enters.
     """
     lever_1, lever_2 = _levers(a)
     tried = 0
@@ -229,7 +229,7 @@ def _move(row, corners, a, path, sun, reach, radius, near, spread, resolution, e
 
 @njit(**OPTIONS)
 def move(table, corners, armatures, path, sun, reach, radius, near, spread, resolution, entries):
-    """As `_move`, for N heliostats and V volumes, into ``entries`` (N, V, 8); NaN if clear.
+    """Do as `_move`, for N heliostats and V volumes, into ``entries`` (N, V, 8); NaN if clear.
 
     Returns the number of poses that were tried.
     """

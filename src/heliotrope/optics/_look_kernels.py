@@ -1,9 +1,9 @@
 # mypy: disable-error-code="no-untyped-call, untyped-decorator"
 # mypy: allow-untyped-defs
-"""Compiled: each mirror's own image at several aims, and its derivative by the beam.
+"""Compiled: each mirror's image at several aims, and how beam displacements change it.
 
 The Gaussians are those of `_image_kernels`; here they are not summed over the field. An image is a
-rectangle of cells, kept column after column, so that moving it by a row is moving a pointer.
+rectangle of cells, kept column after column, so that moving an image by a row only moves a pointer.
 """
 
 import math
@@ -26,7 +26,7 @@ from heliotrope.optics._image_kernels import (
 
 @njit(**INNER)
 def _seen_from(facing, count):
-    """Visible column after which the others follow without a gap."""
+    """Return the visible column after which the rest follow without a gap."""
     for k in range(1, count):
         if int(facing[0, k]) != int(facing[0, k - 1]) + 1:
             return k
@@ -35,7 +35,7 @@ def _seen_from(facing, count):
 
 @njit(**_FAST)
 def _bounds(local, count, start, begin, end, least, tops, box):
-    """Find the rectangle above ``least``: first column, columns in order, first row, rows."""
+    """Find the rectangle of cells above ``least``: first column, columns, first row, rows."""
     for k in range(count):
         tops[k] = 0.0
     for r in range(begin, end + 1):
@@ -93,12 +93,13 @@ def _keep(local, visible, first, box, values, used):
 @njit(**OPTIONS)
 def look(first, last, looks, mirrors, sun, light, slopes, pointing, sums, parts, surfaces, moments,
          shape, columns, grid, least, reach, values, boxes, begins):  # fmt: skip
-    """Compute the cells of images ``first`` to ``last``, ``looks`` per mirror, W/m².
+    """Compute the cells of images ``first`` to ``last``, W/m², with ``looks`` images per mirror.
 
-    ``mirrors`` has one row for each image. ``reach`` (H,): rows below and above the surface that
-    count; ``grid`` has the most of them. ``boxes`` (J, 4) gets the first column, columns, first row
-    and rows of each; ``begins`` (J,), where its cells begin in ``values``, is given for the first.
-    Cells below ``least`` of an image's peak are left out at its edges.
+    ``mirrors`` has one row for each image. ``reach`` (H,): number of rows below and above the
+    surface that are included; ``grid`` contains the largest of these numbers. ``boxes`` (J, 4)
+    receives the first column, columns, first row and rows of each image. ``begins`` (J,) is where
+    the cells of each image begin in ``values``; the caller sets the first entry. Cells below
+    ``least`` of an image's peak are left out at its edges.
     """
     weights, variances = sums
     low, step, number, _ = grid
@@ -163,9 +164,10 @@ def spread(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts
 
     ``scatter`` (H, 3): Cholesky factor (uu, uv, vv) of the covariance of each beam's own error,
     rad. ``modes`` (H, M, 2): displacement of each beam by M shared errors, rad. ``own`` (rows,
-    columns) gets variances, (W/m²)²; ``shared`` (M, rows, columns) changes of flux, W/m²;
-    ``value`` (H,) the sum over cells of each mirror's own variance times ``worth`` (rows, columns).
-    ``slope`` (H, 2) gets the derivative of each mirror's power by its beam's displacement, W/rad.
+    columns) gets variances, (W/m²)²; ``shared`` (M, rows, columns) receives changes of flux, W/m²;
+    ``value`` (H,) receives, for each mirror, the sum over cells of its own variance times ``worth``
+    (rows, columns). ``slope`` (H, 2) receives the derivative of each mirror's power with respect to
+    its beam's displacement, W/rad.
     """
     weights, variances = sums
     low, step, number, area = grid
@@ -229,7 +231,7 @@ def spread(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts
 @njit(**_FAST)
 def _take(gradient, begin, end, facing, visible, scatter, modes, worth, own, shared, i, value,
           slope):  # fmt: skip
-    """Add squares and sums of a mirror's derivatives, and clear these."""
+    """Add the squares and the sums of a mirror's derivatives, and clear the derivatives."""
     for r in range(begin, end + 1):
         for k in range(visible):
             gu, gv, column = gradient[0, r, k], gradient[1, r, k], int(facing[0, k])

@@ -1,6 +1,6 @@
 r"""Atmospheric attenuation between a mirror and the receiver, by published models.
 
-Fraction of the light that is lost over d km:
+The fraction of the light that is lost over d km is:
 
 - `clear`: 0.006789 + 0.1046 d − 0.0170 d² + 0.002845 d³ (Vittitoe and Biggs, SAND78-1137C, 1978,
   for a visibility of 23 km; the default of DELSOL3 and SolarPILOT).
@@ -8,7 +8,8 @@ Fraction of the light that is lost over d km:
 - `mirval`: 0.00679 + 0.1176 d − 0.0197 d² to 1 km, then 1 − exp(−0.1106 d) (Leary and Hankins,
   SAND77-8280, 1979, p. 14).
 - `ballestrin-clear`: 0.0029544 + 0.1522128 d − 0.018598 d² + 0.0015182 d³, and `ballestrin-hazy`:
-  0.0077941 + 0.5549083 d − 0.147887 d² + 0.0153718 d³ (Ballestrín's models as given in Tonatiuh).
+  0.0077941 + 0.5549083 d − 0.147887 d² + 0.0153718 d³ (Ballestrín's models as implemented in
+  Tonatiuh).
 - `none`: 0.
 - A number, the visibility V in km: 1 − exp(−d ln 50 / V), Koschmieder's law at a contrast of 2 %.
 

@@ -1,6 +1,6 @@
 r"""Beams: the sun's angular radius, the width of a beam, and its irradiance along the axis.
 
-Every other module takes these from here. There are two beam models:
+All other modules take these quantities from this module. There are two beam models:
 
 - `beam_sigma` returns the standard deviation of a Gaussian beam, to compute what falls on a
   receiver. The angular variances of the solar disk, of the mirror slope and of the tracking add up;
@@ -45,8 +45,8 @@ def beam_sigma(
     slant
         Distance from mirror to aperture, m, (...).
     tracking, slope
-        Standard deviations per axis of the *normal*, of the whole mirror (tracking) and over its
-        surface (slope), rad, (...). Each counts twice in the beam.
+        Standard deviations per axis of the *normal*, for the whole mirror (tracking) and over its
+        surface (slope), rad, (...). Each is doubled in the beam.
     sun_shape
         Standard deviation per axis of the solar disk, rad, (...).
 
@@ -74,7 +74,7 @@ def checked(name: str, value: npt.ArrayLike, unit: str, *, positive: bool = Fals
     Raises
     ------
     InputError
-        If a number is not finite, negative, or 0 where ``positive`` is set.
+        If a number is not finite or is negative, or is 0 although ``positive`` is set.
     """
     array = as_float(value)
     invalid = ~(np.isfinite(array) & ((array > 0.0) if positive else (array >= 0.0)))
@@ -93,7 +93,7 @@ class MirrorOptics:
     Attributes
     ----------
     width, height
-        m, (N,).
+        Size of each mirror, m, (N,).
     focus
         Focal distance from canting and curvature together, m, (N,); infinite if flat.
     error
@@ -164,7 +164,7 @@ class MirrorOptics:
 
     @property
     def half_diagonal(self) -> FloatArray:
-        """m, (N,)."""
+        """Half the diagonal of each mirror, m, (N,)."""
         return as_float(0.5 * np.hypot(self.width, self.height))
 
     @property
@@ -183,7 +183,7 @@ class MirrorOptics:
         )
 
     def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return radius (m), inverse focus (1/m) and spread (rad) for the kernels."""
+        """Return radius (m), inverse focal distance (1/m) and spread (rad), for the kernels."""
         return self.half_diagonal, 1.0 / self.focus, self.spread
 
 
@@ -251,14 +251,15 @@ def concentration(
     focus: npt.ArrayLike,
     half_angle: npt.ArrayLike = SUN_RADIUS,
 ) -> FloatArray:
-    """Return the ratio of on-axis irradiance to that on the mirror times reflectivity.
+    """Return the ratio of the on-axis irradiance to that on the mirror times its reflectivity.
 
-    The mirror is a disk of ``area`` with an ideal focus at normal incidence; the sun is a uniform
-    disk. From a point at distance x, the part of the mirror within √(area/π) and within x β / |1 −
-    x/b| of its centre shows the sun at the sun's radiance, so C is the square of min(√(area/π) / (x
-    β), 1 / |1 − x/b|). Ho et al. give the mean over the beam's cross-section, which is smaller
-    everywhere (`mean_concentration`). At oblique incidence a mirror may be stronger near its line
-    foci, up to the limit set by the sun's radiance, which is the first of the two terms.
+    The mirror is assumed to be a disk of ``area`` with an ideal focus at normal incidence, and the
+    sun a uniform disk. From a point at distance x, the part of the mirror within √(area/π) and
+    within x β / |1 − x/b| of its centre shows the sun at the sun's radiance, so C is the square of
+    min(√(area/π) / (x β), 1 / |1 − x/b|). Ho et al. give the mean over the beam's cross-section,
+    which is smaller everywhere (`mean_concentration`). At oblique incidence a mirror may be
+    stronger near its line foci, up to the limit set by the sun's radiance, which is the first of
+    the two terms.
 
     Parameters
     ----------
@@ -283,11 +284,13 @@ def mean_concentration(
     focus: npt.ArrayLike,
     half_angle: npt.ArrayLike = SUN_RADIUS,
 ) -> FloatArray:
-    """Return the beam irradiance, averaged over the cross-section, over that on the mirror.
+    """Return the ratio of the beam's mean irradiance to the irradiance on the mirror.
 
-    The estimate of Ho, Ghanbari and Diver (2011) for specular reflection by a focused mirror:
-    mirror area over beam area, C = (|1 − x/b| + x β / R)⁻², where R is the radius of a disk with
-    the mirror's area. Eye hazards are judged by the irradiance on the axis, which is larger.
+    The mean is taken over the cross-section of the beam.
+
+    This is the estimate of Ho, Ghanbari and Diver (2011) for specular reflection by a focused
+    mirror: mirror area over beam area, C = (|1 − x/b| + x β / R)⁻², where R is the radius of a disk
+    with the mirror's area. Eye hazards are judged by the irradiance on the axis, which is larger.
 
     Parameters
     ----------
@@ -319,11 +322,12 @@ class Crossing:
 
 
 def crossing(given: Beams, points: npt.ArrayLike, *, dni: float = NOMINAL_DNI) -> Crossing:
-    """Return the irradiance from all beams at points (P, 3), such as standby points.
+    """Return the irradiance at points (P, 3), such as standby points, from all beams.
 
-    The mirror is a disk with an ideal focus. From a point at distance d from the axis, the sun is
-    visible in the part of the disk within x β / |1 − x/b| of d / |1 − x/b|. The area common to
-    these two disks is known in closed form. On the axis the result equals that of `concentration`.
+    Each mirror is assumed to be a disk with an ideal focus. From a point at distance d from the
+    axis, the sun is visible in the part of the disk that lies within x β / |1 − x/b| of the
+    distance d / |1 − x/b| from its centre. The area common to these two disks is known in closed
+    form. On the axis the result is equal to the result of `concentration`.
     """
     p = np.atleast_2d(as_vectors(points, "points"))
     to = p[:, None, :] - given.origin
@@ -361,12 +365,12 @@ class ExpectedError:
 
     @property
     def rms(self) -> FloatArray:
-        """Two-dimensional root mean square, rad, (M,)."""
+        """Two-dimensional root mean square of the error, rad, (M,)."""
         return np.asarray(np.sqrt(np.trace(self.covariance, axis1=-2, axis2=-1)))
 
     @property
     def ellipse(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The 90 % ellipse: semi-axes (rad, longer first) and angle of the longer axis, (M,).
+        """The 90 % ellipse: semi-axes, rad, longer first, and angle of the longer axis, each (M,).
 
         The angle is counterclockwise from the right, rad.
         """
@@ -392,7 +396,7 @@ def _common_area(r: FloatArray, s: FloatArray, d: FloatArray) -> FloatArray:
 
 
 def reaches(reach: npt.ArrayLike, count: int) -> FloatArray:
-    """Return the reach of each beam, m, (count,), from one number or from one number per beam."""
+    """Return the reach of each beam, m, (count,), from a single number or one number per beam."""
     lengths = as_float(reach)
     if not (np.isfinite(lengths) & (lengths > 0.0)).all() or lengths.shape not in (
         (),

@@ -1,4 +1,4 @@
-"""Mirrors of a scene divided into canted facets, whatever the plant file says of them."""
+"""Divides the mirrors of a scene into canted facets, whatever the plant file specifies."""
 
 from dataclasses import replace
 from typing import Literal
@@ -32,7 +32,8 @@ def canted(
     Parameters
     ----------
     mirrors
-        Mirrors in their poses; their focal length becomes that of each facet's own curvature.
+        Mirrors in their poses; their focal length becomes the focal length of each facet's own
+        curvature.
     facets
         Columns and rows, 1 to 50 each.
     canting
@@ -57,7 +58,7 @@ def canted(
     else:
         tilt, focal = _off_axis(center, canting, plant, aim), mirrors.slant
     own = np.broadcast_to(mirrors.focal[:, None], center.shape[:2])
-    # The mirror's own focal length serves to cast what its neighbours hide.
+    # The mirror's own focal length is used only for casting the shadows of its neighbours.
     return replace(mirrors, focal=focal).with_facets(FacetTable(center, tilt, half, own))
 
 
@@ -73,7 +74,7 @@ def _focal(canting: npt.ArrayLike, count: int) -> FloatArray:
 def _off_axis(
     center: FloatArray, sun: npt.ArrayLike, plant: Plant | None, aim: npt.ArrayLike | None
 ) -> FloatArray:
-    """Return tilts for which the facets send the sun to the aim, (H, F, 2)."""
+    """Return the tilts with which the facets send the sunlight to the aim, (H, F, 2)."""
     if plant is None:
         raise InputError(
             "canting: off-axis canting needs the plant, because its heliostats must face that sun"

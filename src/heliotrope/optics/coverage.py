@@ -20,10 +20,10 @@ from heliotrope.jit import INLINED, OPTIONS
 def cover_edges(edges, area):
     """Add the contributions of the edges (E, 4) of closed polygons to ``area`` (H, W + 1).
 
-    By Green's theorem an edge bounds everything to its right. Its part in a row is split at the
-    borders of cells. A part of height d whose mean place is the share m across its cell covers
-    d (1 − m) of that cell and d of every cell to the right, so d m is added to the next cell.
-    The cumulative sum along each row is then the covered area, exactly.
+    By Green's theorem an edge bounds everything to its right. The part of an edge in a row is split
+    at the cell borders. A piece of height d, whose mean position is at the fraction m across its
+    cell, covers d (1 − m) of that cell and d of every cell to the right, so d m is added to the
+    next cell. The cumulative sum along each row is then the covered area, exactly.
     """
     rows, columns = area.shape[0], area.shape[1] - 1
     for e in range(len(edges)):
@@ -45,7 +45,7 @@ def cover_edges(edges, area):
 
 @njit(**INLINED)
 def _cover_row(line, left, right, height, columns):
-    """Spread one row's part of an edge over the cells from ``left`` to ``right``."""
+    """Distribute one row's part of an edge over the cells from ``left`` to ``right``."""
     if right <= 0.0:
         line[0] += height
         return
@@ -69,7 +69,7 @@ def coverage(polygons: Sequence[FloatArray], shape: tuple[int, ...]) -> FloatArr
     Parameters
     ----------
     polygons
-        Polygons, (K, 2) each: positions across and down in cells, in either sense of rotation.
+        Polygons, each (K, 2): positions across and down, in cells, in either sense of rotation.
         Where polygons overlap, their fractions add up to at most 1.
     shape
         Rows and columns.

@@ -1,4 +1,4 @@
-"""Files with the flux and the efficiencies of a plant, for people and for other programs.
+"""Writes the flux and the efficiencies of a plant to files, for people and other programs.
 
 - `write_heliostats`: one line per heliostat, with SolarPILOT's column names.
 - `write_map`: the flux on the receivers, one line per cell.
@@ -19,7 +19,7 @@ from heliotrope.files.text import write_file
 from heliotrope.geometry import FloatArray
 from heliotrope.optics.plant_flux import EFFICIENCIES, FluxTable, PlantFlux
 
-#: Columns of a table of heliostats, as SolarPILOT exports them.
+#: Columns of a heliostat table, as SolarPILOT exports them.
 HELIOSTAT_COLUMNS = (
     "Heliostat ID", "Pos-x", "Pos-y", "Pos-z", "Aim-x", "Aim-y", "Aim-z", "Reflectivity",
     "Soiling", "Total eff", "Cosine eff", "Attenuation", "Blocking", "Shading",
@@ -41,8 +41,8 @@ def write_heliostats(path: str | Path, found: PlantFlux, year: FluxTable | None 
 
     Notes
     -----
-    "Blocking" and "Shading" are computed separately; "Shading and blocking" is that of their exact
-    union, which enters the total.
+    "Blocking" and "Shading" are computed separately; "Shading and blocking" is the efficiency for
+    their exact union, which enters the total.
     """
     e = found.efficiencies
     columns: list[FloatArray] = [
@@ -80,7 +80,7 @@ def write_map(path: str | Path, found: PlantFlux) -> None:
 
 
 def write_netcdf(path: str | Path, found: PlantFlux) -> None:
-    """Write efficiencies and flux maps as NetCDF; W/m² and shares."""
+    """Write efficiencies (as fractions) and flux maps (W/m²) as NetCDF."""
 
     def write(stream: BinaryIO) -> None:
         # SciPy closes what it writes to.
@@ -148,7 +148,7 @@ def _put(
 
 
 def write_sam(path: str | Path, table: FluxTable) -> None:
-    """Write a table over sun positions in SAM's format for power towers (CSV).
+    """Write efficiencies over sun positions in SAM's format for power towers (CSV).
 
     Each line contains the sun's azimuth (clockwise from north) and zenith angle in degrees, and the
     optical efficiency of the field, without a header: the matrix ``eta_map`` of SSC's
@@ -162,14 +162,14 @@ def write_sam(path: str | Path, table: FluxTable) -> None:
 def write_solartherm(path: str | Path, table: FluxTable) -> None:
     """Write a table over a year in SolarTherm's format (.motab).
 
-    The table ``optics`` has the declination along rows and the hour angle along columns, in
+    The table ``optics`` has declinations along its rows and hour angles along its columns, in
     degrees, as in SolarTherm's ``Solar_angles.dec_hra``; the efficiency is 0 where the sun is below
     2°.
 
     Raises
     ------
     InputError
-        If the table is over times instead of a year.
+        If the table covers individual times instead of a year.
     """
     if not np.isfinite(table.declination).all():
         raise InputError(f"{path}: SolarTherm needs a table over a year; use flux_year")
@@ -195,7 +195,7 @@ def write_solartherm(path: str | Path, table: FluxTable) -> None:
 
 
 def _texts(values: FloatArray, digits: int) -> list[str]:
-    # Adding 0 takes the sign from what rounds to −0.
+    # Adding 0 removes the sign from numbers that round to −0.
     rounded = np.round(values, digits) + 0.0
     return ["" if np.isnan(v) else f"{v:.{digits}f}" for v in rounded.tolist()]
 

@@ -1,4 +1,4 @@
-"""Glare: the effect of heliostat beams on the eye. For information only.
+"""Glare: the effect of heliostat beams on the eye; for information only.
 
 The method has the form of Ho, Ghanbari and Diver, "Methodology to assess potential glint and glare
 hazards from concentrating solar power plants", J. Sol. Energy Eng. 133 (2011) 031021. We have not
@@ -32,13 +32,13 @@ BURN, WIDE = 1180.0, 0.118
 #: Retinal irradiance that leaves an after-image at 1 rad, W/m² (3.59e-5 W/cm²), and the power
 #: of the angle by which the threshold falls.
 FLASH, FLASH_POWER = 0.359, 1.77
-#: Smaller sources count as this large, rad: far below the blur of any eye.
+#: Smaller sources are treated as this large, rad, which is far below the blur of any eye.
 SMALLEST = 1e-6
 
 
 @dataclass(frozen=True)
 class Eye:
-    """An eye: pupil (m; daylight-adapted), focal length (m), transmittance of the ocular media."""
+    """An eye: daylight-adapted pupil (m), focal length (m), transmittance of the ocular media."""
 
     pupil: float = 2e-3
     focal_length: float = 17e-3
@@ -60,7 +60,7 @@ DAYLIGHT = Eye()
 
 
 class Hazard(IntEnum):
-    """Effect of a short look."""
+    """Effect of a short look into a beam."""
 
     LOW = 0
     AFTER_IMAGE = 1
@@ -91,7 +91,7 @@ def retinal_irradiance(
     subtended
         ω, full angle of the source as seen from the eye, rad, above 0.
     eye
-        Its pupil d, focal length f and transmission τ.
+        The eye, with its pupil d, focal length f and transmission τ.
     """
     e, w = _checked(corneal, subtended)
     return as_float(e * eye.pupil**2 * eye.transmission / (eye.focal_length * w) ** 2)
@@ -100,7 +100,7 @@ def retinal_irradiance(
 def burn_threshold(subtended: npt.ArrayLike) -> FloatArray:
     """Return the retinal irradiance from which permanent damage is possible, W/m².
 
-    0.118 W/cm² / ω below ω = 0.118 rad, 1 W/cm² above.
+    It is 0.118 W/cm² / ω below ω = 0.118 rad, and 1 W/cm² above.
     """
     _, w = _checked(0.0, subtended)
     return as_float(BURN / np.minimum(w, WIDE))
@@ -109,7 +109,7 @@ def burn_threshold(subtended: npt.ArrayLike) -> FloatArray:
 def flash_threshold(subtended: npt.ArrayLike) -> FloatArray:
     """Return the retinal irradiance from which an after-image is possible, W/m².
 
-    3.59e-5 W/cm² / ω^1.77, ω in rad.
+    It is 3.59e-5 W/cm² / ω^1.77, with ω in rad.
     """
     _, w = _checked(0.0, subtended)
     return as_float(FLASH / w**FLASH_POWER)
@@ -154,8 +154,9 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
     """Return an upper bound of the hazard of several sources seen at once.
 
     Images of sources that lie side by side may touch on the retina and heat it as one. The
-    arrangement of the sources is not considered: the worst selection counts, as one disk with the
-    sum of their solid angles. An additional source can only increase the bound.
+    arrangement of the sources is not considered. Instead, the worst selection of sources is treated
+    as one disk with the sum of their solid angles. An additional source can only increase the
+    bound.
 
     Parameters
     ----------
@@ -165,10 +166,10 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
 
     Notes
     -----
-    Of all selections with solid angle W (in units of ω²), none has more irradiance than g(W), the
-    selection of the brightest sources first, including a fraction of the last source. g is concave
-    and piecewise linear. Both thresholds depend on g and W as g / W^a with a constant a from 0 to
-    1, which has no maximum in the interior of a linear piece; a changes only at ω = 0.118 rad. The
+    Of all selections with solid angle W (in units of ω²), none has more irradiance than g(W), which
+    selects the brightest sources first, with a fraction of the last source. g is concave and
+    piecewise linear. Both thresholds depend on g and W as g / W^a with a constant a from 0 to 1,
+    which has no maximum in the interior of a linear piece; a changes only at ω = 0.118 rad. The
     maximum is therefore at one of the corners or at that point, and is found in N log N.
     """
     e, w = np.broadcast_arrays(as_float(corneal), as_float(subtended))
@@ -198,7 +199,7 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
 
 
 def _corner(light: FloatArray, room: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return g and W where ω passes 0.118 rad, or 0 and 0 if it does not."""
+    """Return g and W where ω passes 0.118 rad; 0 and 0 if it does not."""
     wide = WIDE * WIDE
     before = np.concatenate([np.zeros((*room.shape[:-1], 1)), room[..., :-1]], axis=-1)
     below = np.concatenate([np.zeros((*light.shape[:-1], 1)), light[..., :-1]], axis=-1)
@@ -213,10 +214,10 @@ def _corner(light: FloatArray, room: FloatArray) -> tuple[FloatArray, FloatArray
 def glare_at(
     given: Beams, points: npt.ArrayLike, *, dni: float = NOMINAL_DNI, eye: Eye = DAYLIGHT
 ) -> Glare:
-    """Return the hazard to an eye at points (P, 3) that looks into the beams.
+    """Return the hazard to an eye that looks into the beams from points (P, 3).
 
     Each beam is a source as wide as the part of its mirror in which the sun is visible. A mirror
-    with concentration C subtends ω = 2 β √C, since it shows the sun at the sun's radiance.
+    with concentration C subtends ω = 2 β √C, because it shows the sun at the sun's radiance.
     """
     _irradiance(dni)
     concentration = crossing(given, points, dni=dni).concentration
@@ -234,16 +235,16 @@ def safe_range(
 ) -> tuple[float, float]:
     """Return the range of distances along one beam at which a look into it may cause a burn, m.
 
-    The range is (0, 0) if the beam causes burns nowhere. On the axis the ratio to the threshold is
-    K ω with K = ρ DNI d² τ / (4 β² f² · 0.118 W/cm²) while ω < 0.118 rad, and ω = 2 min(R / x, β /
-    |1 − x/b|); the threshold is reached where ω = 1 / K.
+    The range is (0, 0) if the beam causes burns nowhere along it. On the axis the ratio to the
+    threshold is K ω with K = ρ DNI d² τ / (4 β² f² · 0.118 W/cm²) while ω < 0.118 rad, and ω = 2
+    min(R / x, β / |1 − x/b|); the threshold is reached where ω = 1 / K.
 
     Parameters
     ----------
     area, focus
         Area and focal length of the mirror, m² and m.
     dni, reflectivity
-        W/m²; 0 to 1.
+        Irradiance, W/m², and reflectivity, 0 to 1.
     eye
         The observer's eye.
     """
@@ -277,7 +278,7 @@ class GlareMap:
     points
         ENU, m, (H, W, 3).
     glare
-        Arrays of shape (H, W).
+        Hazards, as arrays of shape (H, W).
     """
 
     right: FloatArray
@@ -287,7 +288,7 @@ class GlareMap:
 
     @property
     def radius(self) -> float:
-        """Largest distance from the point at which a look may burn, m; 0 if it burns nowhere."""
+        """Largest distance from the point at which a look may cause a burn, m; 0 if none may."""
         bad = self.glare.hazard == Hazard.DAMAGE
         away = np.hypot(*np.meshgrid(self.right, self.up))
         return float(np.max(np.where(bad, away, 0.0)))

@@ -1,18 +1,18 @@
-r"""Intercept: the fraction of a heliostat's beam that enters the receiver aperture.
+r"""Computes the intercept: the fraction of a heliostat's beam that enters the receiver aperture.
 
-Two models:
+There are two models:
 
-- `intercept_circle` and `intercept_rectangle`, our own: the beam is Gaussian, with the standard
-  deviation σ of `beam_sigma` on the aperture plane. A centred circle of radius R intercepts $1 -
-  \exp(-R^2 / 2 σ^2)$. Every σ is a standard deviation *per axis*; the two-dimensional RMS is √2
-  times as large.
-- `intercept_disks`, Malan's (3.2)-(3.3): the beam is a disk of uniform irradiance, and the aperture
-  is the same disk about the aim.
+- `intercept_circle` and `intercept_rectangle` are our own model: the beam is Gaussian, with the
+  standard deviation σ of `beam_sigma` on the aperture plane. A centred circle of radius R
+  intercepts $1 - \exp(-R^2 / 2 σ^2)$. Every σ is a standard deviation *per axis*; the
+  two-dimensional RMS is √2 times as large.
+- `intercept_disks` is Malan's model, (3.2)-(3.3): the beam is a disk of uniform irradiance, and the
+  aperture is the same disk about the aim.
 
 Use the Gaussian model: a ray trace (`examples/malan_intercept.py`) agrees with it to 0.7 percentage
 points. For the aperture in (3.2) as printed, an error of 1 mrad costs 0.4 points according to the
-ray trace and 10.3 according to the disk model, because a uniform beam loses power at the rim at
-once, whereas a real beam is weak at its rim.
+ray trace and 10.3 according to the disk model, because a displaced uniform beam immediately loses
+power at its rim, where a real beam is weak.
 """
 
 import numpy as np
@@ -22,8 +22,8 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, common_shape
 from heliotrope.optics.beam import SUN_RADIUS, checked
 
-# Nodes of the integral over a circle, and how many σ of the beam it covers: what it leaves
-# out is 2e-17.
+# Number of nodes of the integral over a circle, and how many σ of the beam it covers; it omits
+# 2e-17 of the beam.
 _NODES = 128
 _REACH = 8.5
 
@@ -44,9 +44,9 @@ def intercept_circle(
         Radius of the aperture, m, (...).
     sigma
         Standard deviation per axis of the beam on the aperture plane, m, (...), as returned by
-        `beam_sigma`; with ``sigma_up`` that of the horizontal axis.
+        `beam_sigma`; if ``sigma_up`` is specified, for the horizontal axis only.
     sigma_up
-        That of the vertical axis if the beam is elliptical, m, (...).
+        Standard deviation for the vertical axis if the beam is elliptical, m, (...).
     right, up
         Beam centre relative to the aperture centre, m, (...), such as ``image_offsets(...).right``.
         NaN yields NaN.
@@ -60,8 +60,8 @@ def intercept_circle(
     -----
     A centred circular beam follows 1 − exp(−R²/2σ²); an offset beam follows the Rice distribution,
     which is the non-central χ² with two degrees of freedom. All cases are computed by one
-    Gauss-Legendre integral: within 1e-10 up to R = 200 σ for elliptical beams, and for circular
-    beams within 1e-11 of SciPy's ``chndtr``, which is limited to R = 10⁵ σ.
+    Gauss-Legendre integral. It is accurate to 1e-10 up to R = 200 σ for elliptical beams; for
+    circular beams it agrees to 1e-11 with SciPy's ``chndtr``, which is limited to R = 10⁵ σ.
     """
     r = checked("radius", radius, "m", positive=True)
     s = checked("sigma", sigma, "m", positive=True)
@@ -106,9 +106,9 @@ def intercept_disks(
 
     Notes
     -----
-    Malan (3.2)-(3.3) as printed: 92.2 % at 0.75 mrad and 89.7 % at 1 mrad with his 9.3 mrad and 1.5
-    mrad. For a perfect mirror his R is d θ_s, which his text calls the diameter of the smallest
-    image; its radius is half of that.
+    Malan's (3.2)-(3.3) as printed yield 92.2 % at 0.75 mrad and 89.7 % at 1 mrad with his 9.3 mrad
+    and 1.5 mrad. For a perfect mirror his R is d θ_s, which his text calls the diameter of the
+    smallest image; the radius of that image is half as large.
     """
     t = checked("tracking", tracking, "rad")
     q = checked("sun_angle", sun_angle, "rad") / 2.0 + checked("slope", slope, "rad")
@@ -143,7 +143,8 @@ def intercept_rectangle(
 
     Notes
     -----
-    The product of two one-dimensional fractions, each a difference of error functions; exact.
+    The result is exact: the product of two one-dimensional fractions, each a difference of error
+    functions.
     """
     w = checked("width", width, "m", positive=True)
     h = checked("height", height, "m", positive=True)
@@ -166,10 +167,11 @@ def _within(half: FloatArray, sigma: FloatArray, center: FloatArray) -> FloatArr
 def _chords(
     radius: FloatArray, sigma: FloatArray, sigma_up: FloatArray, x: FloatArray, y: FloatArray
 ) -> FloatArray:
-    """Return the integral over chords of the circle, u across them and the share along them.
+    """Return the integral over chords of the circle, of the density across times the share along.
 
-    The chords lie along the beam's longer axis, so that the share along a chord varies
-    slowly over the few σ of u that matter; u = R sin φ takes away the root at the rim.
+    The chords lie along the beam's longer axis, so that the share along a chord varies slowly over
+    the few σ of u that matter, where u is the position across the chords. The substitution u = R
+    sin φ removes the square root at the rim.
     """
     tall = sigma_up > sigma
     narrow, wide = np.where(tall, sigma, sigma_up), np.where(tall, sigma_up, sigma)

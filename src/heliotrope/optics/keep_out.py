@@ -1,11 +1,12 @@
-"""Beams and keep-out volumes: which beams enter them, at rest and in motion; the safe path.
+"""Finds which beams enter keep-out volumes, at rest and in motion, and safe paths from stow.
 
 A beam is modelled as a solid of revolution about its axis that is guaranteed to contain the beam:
 as wide as the mirror diagonal, widening by the sun's radius and a stated error, and further beyond
-the focus of the mirror (see `_keep_out_kernels`). "Clear" is therefore proven, whereas "enters"
-means that this solid comes within a millimetre of the volume. The solid is made of spheres, so it
-extends half a mirror diagonal beyond both ends, and a volume within the swing of a mirror counts as
-entered. Nothing shades a beam in this model, neither the ground nor other mirrors nor the tower.
+the focus of the mirror (see `_keep_out_kernels`). A result of "clear" is therefore certain, whereas
+"enters" means only that this solid comes within a millimetre of the volume. The solid is made of
+spheres, so it extends half a mirror diagonal beyond both ends, and a volume within the swing of a
+mirror counts as entered. Nothing shades a beam in this model, neither the ground nor other mirrors
+nor the tower.
 """
 
 from collections.abc import Sequence
@@ -40,7 +41,7 @@ WAY_STEP = 0.02
 
 
 def clearance(points: npt.ArrayLike, volumes: Sequence[Volume]) -> FloatArray:
-    """Return signed distances (..., V) of points (..., 3) from volumes, m; negative inside."""
+    """Return signed distances of points (..., 3) from V volumes, m, (..., V); negative inside."""
     p = as_vectors(points, "points")
     table, corners = _packed(volumes)
     flat = p.reshape(-1, 3)
@@ -80,7 +81,7 @@ class Entries:
 
     @property
     def entered(self) -> npt.NDArray[np.bool_]:
-        """Whether each beam enters, (N, V)."""
+        """Whether each beam enters each volume, (N, V)."""
         return np.asarray(np.isfinite(self.first))
 
 
@@ -150,7 +151,7 @@ class Sweep:
 
     @property
     def entered(self) -> npt.NDArray[np.bool_]:
-        """Whether the beam is not proven to stay clear, (N, V)."""
+        """Whether each beam enters each volume, or may enter it, (N, V)."""
         return np.asarray(np.isfinite(self.at))
 
 
@@ -230,7 +231,7 @@ def _leaving(
     mirrors: MirrorOptics,
     reach: FloatArray,
 ) -> FloatArray:
-    """Return the last contact in the pose of the entry, m, (N, V); at least the first."""
+    """Return the last contact in the pose of the entry, m, (N, V); at least the first contact."""
     last = entries[..., 1].copy()
     radius, near, spread = mirrors.arrays()
     for v in range(len(table)):
@@ -260,7 +261,7 @@ class Way:
     motion
         Result of the keep-out check.
     text
-        One line for the operator.
+        Result for the operator, in one line.
     """
 
     aims: FloatArray
@@ -271,10 +272,10 @@ class Way:
 
     @property
     def back(self) -> FloatArray:
-        """The same poses in reverse, rad, (M, 2): down, outwards, elevation, then azimuth.
+        """The path back to stow, rad, (M, 2): down, outwards, elevation, then azimuth.
 
-        The poses are proven clear only for the sun position of the check; hours later a new path is
-        needed.
+        These are the poses of `path` in reverse. They are clear only for the sun position of the
+        check; hours later a new path is needed.
         """
         return self.path[::-1]
 
@@ -282,9 +283,9 @@ class Way:
 def ground_way(
     vertex: npt.ArrayLike, first: npt.ArrayLike, foot: npt.ArrayLike, standby: npt.ArrayLike
 ) -> FloatArray:
-    """Return aims (K, 3) along straight lines from ``first`` to ``foot`` to ``standby``.
+    """Return aims (K, 3) along straight lines from ``first`` to ``foot`` and on to ``standby``.
 
-    Successive aims are at most 20 mrad apart as seen from the vertex; all (3,), ENU metres.
+    Successive aims are at most 20 mrad apart as seen from the vertex; all points are (3,), ENU, m.
     """
     m = as_vectors(vertex, "vertex")
     corners = [as_vectors(p, "aim") for p in (first, foot, standby)]
@@ -339,7 +340,7 @@ def safe_way(
     volumes
         Volumes that no beam may enter.
     drives
-        Drives of the two joints, for their stops; default no stops.
+        Drives of the two joints, whose stops apply; default: no stops.
     first_distance
         m.
     reach
@@ -405,12 +406,16 @@ def _angles(
     sun: npt.ArrayLike,
     drives: Drive | None,
 ) -> tuple[FloatArray, npt.NDArray[np.int8]]:
-    """Return joint angles (K, 2) for the aims, each nearest to its predecessor, and the status."""
+    """Return joint angles (K, 2) for the aims, and the status.
+
+    Of the possible poses for an aim, the one nearest to the previous pose is chosen.
+    """
     s = normalize(sun, "sun")
     tracking = track(armature, s, aims, drives=drives)
     angles, status, before = np.empty((len(aims), 2)), np.empty(len(aims), np.int8), stow
     for k in range(len(aims)):
-        # A whole turn of a joint leads to the same pose; without drives, no stop prevents it.
+        # A full revolution of a joint results in the same pose; without drives, no stop prevents
+        # it.
         options = tracking.angles[k]
         if drives is None:
             options = before + (options - before + np.pi) % (2.0 * np.pi) - np.pi
@@ -423,7 +428,7 @@ def _angles(
 
 
 def _packed(volumes: Sequence[Volume]) -> tuple[FloatArray, FloatArray]:
-    """Return the volumes as rows (V, SIZE) and corners (C, 2) for the kernels."""
+    """Return the volumes in the form for the kernels: rows (V, SIZE) and corners (C, 2)."""
     table = np.zeros((len(volumes), kernels.SIZE))
     corners: list[FloatArray] = []
     count = 0

@@ -78,7 +78,7 @@ class Beam:
         centre: npt.ArrayLike = (0.0, 0.0),
         power: float | None = None,
     ) -> "Beam":
-        """Return the beam from a picture taken from the front of the target, at normal view.
+        """Return the beam from a picture of the target taken head-on.
 
         Parameters
         ----------
@@ -105,8 +105,8 @@ class Beam:
         Raises
         ------
         InputError
-            If their samples do not lie on a common grid, as those of `reflected_beam` with one step
-            do.
+            If their samples do not lie on a common grid. The beams that `reflected_beam` returns
+            for the same step do.
         """
         step = beams[0].step
         places = np.array([beam.origin for beam in beams]) / step
@@ -124,7 +124,7 @@ class Beam:
 
     @cached_property
     def power(self) -> float:
-        """Power, W."""
+        """Power of the beam, W."""
         return float(self.flux.sum() * self.step**2)
 
     @cached_property
@@ -172,7 +172,7 @@ class Beam:
         return replace(self, origin=self.origin + as_float(by))
 
     def coarser(self, factor: int) -> "Beam":
-        """Return the beam with blocks of ``factor`` samples merged; power and centroid stay."""
+        """Return the beam with blocks of ``factor`` samples merged, at equal power and centroid."""
         if factor < 2:
             return self
         rows, columns = (-(-n // factor) for n in self.flux.shape)
@@ -190,7 +190,7 @@ class Beam:
         """Return the mean over an exposure in which the beam moves by metres right and up (2,).
 
         The beam moves uniformly about its position in the middle of the exposure, so the centroid
-        stays.
+        stays unchanged.
         """
         from scipy.signal import fftconvolve
 
@@ -209,7 +209,7 @@ class Beam:
     def on_target(self, target: Target) -> tuple[float, FloatArray]:
         """Return the fraction of the energy that falls on a target, and its centroid, m, (2,).
 
-        The centroid is NaN if that fraction is zero. Samples at the border count in part.
+        The centroid is NaN if that fraction is zero. Samples at the border are counted in part.
         """
         inside = coverage(
             [(target.plane_coordinates(target.corners) - self.origin) / self.step],
@@ -571,7 +571,9 @@ def _mirror_axes(
 def ray_spread(
     target: Target, sun: FloatArray, normal: FloatArray, ray: FloatArray, distance: float
 ) -> tuple[FloatArray, float]:
-    """Return metres on the plane per rad off the ray (2, 2), and the cosine of incidence.
+    """Return the displacement on the plane per angle off the ray, m/rad, (2, 2).
+
+    Also return the cosine of incidence.
 
     The columns are for deviations in the plane of incidence and across it. A deviation e of
     the ray moves its end by d (e − r (e·N) / (r·N)), N being the target's normal.

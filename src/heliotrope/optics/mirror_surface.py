@@ -1,4 +1,4 @@
-"""The surface of one mirror as small elements."""
+"""Divides the surface of a mirror into small elements."""
 
 import numpy as np
 
@@ -23,8 +23,8 @@ def equal_facets(width: float, height: float, count: tuple[int, int], focal: flo
     count
         Columns and rows.
     focal
-        Distance of the focus, m; infinity: all in one plane. The centres lie on the paraboloid z =
-        (x² + y²) / 4f, to which each facet is tangent at its centre.
+        Distance of the focus, m; infinity: all facets lie in one plane. The centres lie on the
+        paraboloid z = (x² + y²) / 4f, to which each facet is tangent at its centre.
     """
     for name, side in (("width", width), ("height", height)):
         if not (np.isfinite(side) and side > 0.0):

@@ -1,4 +1,4 @@
-"""Image offsets: where an imperfect heliostat sends its beam; Malan's error model run forwards.
+"""Image offsets: where an imperfect heliostat sends its beam, by Malan's error model.
 
 A controller knows the *nominal* mechanism and moves the drives to the counts at which that
 mechanism would send the sun to the aim. The *actual* mechanism, with its imperfections, moves to
@@ -27,8 +27,8 @@ from heliotrope.values import Card, Value, dots, span
 class ImageOffsets(Value, Framed):
     """Where beams cross the plane through the aim perpendicular to the line of sight.
 
-    NaN where the nominal mechanism cannot send the sun to the aim, or the beam never
-    reaches the plane.
+    Values are NaN where the nominal mechanism cannot send the sunlight to the aim, or the beam
+    never reaches the plane.
 
     Attributes
     ----------
@@ -67,8 +67,8 @@ class ImageOffsets(Value, Framed):
     def beam_error(self) -> FloatArray:
         """Beam error to the right and upwards, rad, (..., 2).
 
-        Offset over slant range, as in Malan; for a heliostat at its nominal position this is the
-        tangent of the angle.
+        This is the offset divided by the slant range, as in Malan's thesis; for a heliostat at its
+        nominal position it is the tangent of the angle.
         """
         return np.stack([self.right / self.slant, self.up / self.slant], axis=-1)
 
@@ -78,8 +78,8 @@ class ImageOffsets(Value, Framed):
         Parameters
         ----------
         axis
-            Batch axes to average over, such as the time axis; default all. NaN values are left out;
-            the RMS of no values is NaN.
+            Batch axes to average over, such as the time axis; default: all axes. NaN values are
+            left out; the RMS of no values is NaN.
         """
         square = (self.distance / self.slant) ** 2
         known = np.isfinite(square)
@@ -95,7 +95,7 @@ def image_offsets(
     """Return where the beams of actual heliostats fall when driven as nominal heliostats.
 
     All batch shapes broadcast: the sun vectors of a day with one heliostat, sun vectors (times, 1)
-    with mechanisms (heliostats,), or one nominal mechanism with many actual ones.
+    with mechanisms (heliostats,), or one nominal mechanism with many actual mechanisms.
 
     Parameters
     ----------
@@ -155,16 +155,16 @@ def target_offsets(
     Parameters
     ----------
     nominal, actual, sun
-        As for `image_offsets`, with its errors.
+        As for `image_offsets`, which also lists the errors.
     target
-        The target on whose plane they fall.
+        The target on whose plane the beams fall.
     aim
-        ENU metres, (..., 3); default the target centre.
+        Aims, ENU, m, (..., 3); default: the target centre.
 
     Returns
     -------
-    Metres to the right of and above the target centre as seen from the front, (..., 2). NaN as for
-    `image_offsets`, and where the beam arrives from behind.
+    Metres to the right of and above the target centre as seen from the front, (..., 2). NaN where
+    `image_offsets` returns NaN, and where the beam arrives from behind.
     """
     point = target.center if aim is None else as_vectors(aim, "aim")
     _, pose, beam = _stand(nominal, actual, sun, point)
@@ -177,7 +177,10 @@ def target_offsets(
 def _stand(
     nominal: Mechanism, actual: Mechanism, sun: npt.ArrayLike, aim: FloatArray
 ) -> tuple[FloatArray, Pose, FloatArray]:
-    """Return nominal vertex to aim, the actual pose, and the beam (NaN if out of reach)."""
+    """Return the vector from nominal vertex to aim, the actual pose, and the beam.
+
+    The beam is NaN if the aim is out of reach.
+    """
     if (nominal.kind, nominal.joints) != (actual.kind, actual.joints):
         raise InputError(
             f"actual: a {actual.kind} mechanism, but the nominal one is {nominal.kind}; "

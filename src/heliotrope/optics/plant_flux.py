@@ -1,8 +1,8 @@
 """The flux and the efficiencies of a plant: at one sun position, over a day, and over a year.
 
-The efficiencies of the field are listed in the order of the light path, each as a fraction of what
-the previous one left, so that their product is the total: cosine, shading and blocking together
-(`lit`), mirror (reflectivity and soiling), atmosphere, intercept.
+The efficiencies of the field are listed in the order of the light path, each as a fraction of the
+light that the previous step left, so that their product is the total: cosine, shading and blocking
+together (`lit`), mirror (reflectivity and soiling), atmosphere, intercept.
 """
 
 from collections.abc import Callable
@@ -44,7 +44,7 @@ LOWEST = np.radians(2.0)
 
 @dataclass(frozen=True)
 class FieldOptics:
-    """Everything that determines a field's light, apart from the plant and the sun position.
+    """Everything that determines the light of a field, apart from the plant and the sun position.
 
     Attributes
     ----------
@@ -55,16 +55,16 @@ class FieldOptics:
     air
         Atmospheric model, or the visibility, km: `heliotrope.optics.air_loss`.
     slope
-        Standard deviation of the surface normal per axis, rad; None: of the plant file, otherwise
-        1 mrad.
+        Standard deviation of the surface normal per axis, rad; None: the value in the plant file,
+        or else 1 mrad.
     error
         Two-dimensional standard deviation of the mirror normals expected from their calibration,
         rad, () or (N,).
     reflectivity, clean
         Reflectivity of the clean mirror, and the fraction that soiling leaves, 0 to 1, () or (N,).
-        Reflectivity None: of the plant file, otherwise 0.9.
+        A reflectivity of None: the value in the plant file, or else 0.9.
     focus
-        "plant": as the plant file specifies, otherwise "slant"; "slant": each mirror is focused on
+        "plant": as the plant file specifies, or else "slant"; "slant": each mirror is focused on
         its aim; "flat"; or the focal length, m. For mirrors with facets it applies to each facet.
     facets
         Columns and rows of equal facets; None: as in the plant file.
@@ -139,7 +139,7 @@ class FieldOptics:
         return replace(scene, mirrors=mirrors)
 
     def engine(self, scene: Scene) -> FieldFlux:
-        """Return the flux of a scene under this light."""
+        """Return the flux engine for a scene under these conditions."""
         return FieldFlux(scene, sun=self.shape, air=self.air, gaussians=self.gaussians)
 
 
@@ -215,7 +215,7 @@ class PlantFlux(Value, Framed):
 
     @property
     def heliostat_power(self) -> FloatArray:
-        """Power of each heliostat on the receivers, W, (N,)."""
+        """Power that each heliostat sends to the receivers, W, (N,)."""
         return as_float(np.nan_to_num(self.efficiencies.total) * self.area * self.dni)
 
     @property
@@ -235,7 +235,7 @@ class PlantFlux(Value, Framed):
 
     @property
     def heliostats(self) -> int:
-        """Number of heliostats whose beams count."""
+        """Number of heliostats whose beams are counted."""
         return self.maps[0].heliostats
 
     @property
@@ -255,12 +255,12 @@ class PlantFlux(Value, Framed):
 
     @cached_property
     def summary(self) -> dict[str, float]:
-        """Efficiencies of the field, by name; see the module."""
+        """Efficiencies of the field, by name; see the module docstring."""
         return field_efficiencies(self.efficiencies, self.area)
 
 
 def field_efficiencies(shares: Efficiencies, area: FloatArray) -> dict[str, float]:
-    """Return the efficiencies of a field, each as a share of what the previous one left.
+    """Return the efficiencies of a field, each as a fraction of what the previous step left.
 
     Parameters
     ----------
@@ -303,12 +303,12 @@ def field_flux(
     light: FieldOptics | None = None,
     **changes: Any,
 ) -> PlantFlux:
-    """Return the flux from each heliostat on the receivers, and the losses along the light path.
+    """Return the flux of a field on its receivers, and the losses along the light path.
 
     Parameters
     ----------
     plant
-        As calibrated.
+        The plant, with its calibrated mechanisms.
     time
         One time; see `heliotrope.sun.Times`. Alternatively pass ``sun``.
     receiver
@@ -320,8 +320,8 @@ def field_flux(
         Aim points, ENU m, (3,) or (N, 3); None: each heliostat's own aim, or the middle of the
         first receiver.
     rays
-        Number of random rays to trace instead, 1e3 to 1e9; 0: no ray tracing. Ray tracing needs the
-        extra ``rays`` and serves as an independent check.
+        Number of random rays to trace instead of using the engine, 1e3 to 1e9; 0: no ray tracing.
+        Ray tracing needs the extra ``rays`` and serves as an independent check.
     seed
         Seed of the rays.
     progress
@@ -357,7 +357,7 @@ def result_of(plant: Plant, scene: Scene, engine: FieldFlux) -> PlantFlux:
 
 
 def flux_views(engine: FieldFlux) -> list[FluxView]:
-    """Return the flux on the surfaces of a scene; without a mirror that shines the maps are zero.
+    """Return the flux on the surfaces of a scene; the maps are zero if no mirror sends light.
 
     Parameters
     ----------
@@ -377,12 +377,13 @@ def _names(receiver: str | tuple[str, ...]) -> tuple[str, ...]:
 
 
 def one_sun(plant: Plant, time: Times | None, sun: npt.ArrayLike | None) -> FloatArray:
-    """Return the unit vector to the sun, (3,), from one time or the sun itself.
+    """Return the unit vector to the sun, (3,), from a single time or from the vector itself.
 
     Raises
     ------
     InputError
-        If there is not one of them, or the sun is below the horizon.
+        If neither or both are passed, if there are several times, or if the sun is below the
+        horizon.
     """
     if sun is not None and time is None:
         light = normalize(as_vectors(sun, "sun"))
@@ -467,7 +468,7 @@ class FluxTable(Value, Framed):
     sun
         Unit vectors, (M, 3).
     time
-        Unix seconds, (M,); NaN if the table is over sun positions.
+        POSIX seconds, (M,); NaN in a table over sun positions.
     declination, hour
         Declination and hour angle of the sun, rad, (M,); NaN in a table over times.
     weight
@@ -477,7 +478,7 @@ class FluxTable(Value, Framed):
     shares
         Efficiencies of the field, (M,), by name.
     power, peak
-        On all receivers, W, and in the cell with the highest flux, W/m², (M,).
+        Power on all receivers, W, and flux in the cell with the highest flux, W/m², (M,).
     names, position
         Names of the N heliostats.
     heliostat
@@ -524,7 +525,7 @@ class FluxTable(Value, Framed):
 
     @property
     def azimuth(self) -> FloatArray:
-        """Clockwise from north, rad, (M,)."""
+        """Azimuth of the sun, clockwise from north, rad, (M,)."""
         return azimuth_elevation(self.sun)[0]
 
     @property
@@ -549,13 +550,13 @@ def flux_day(
     light: FieldOptics | None = None,
     **changes: Any,
 ) -> FluxTable:
-    """Return the efficiencies of a field at times with sunlight, such as those of a day.
+    """Return the efficiencies of a field at times with sunlight, such as the times of a day.
 
     Parameters
     ----------
     times
-        M times, such as those from `heliotrope.sun.daylight`; times with the sun below 2° are left
-        out.
+        M times, such as the times from `heliotrope.sun.daylight`; times with the sun below 2° are
+        left out.
     plant, receiver, aim, light, **changes
         As for `field_flux`.
     progress

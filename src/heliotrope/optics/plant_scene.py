@@ -1,7 +1,7 @@
 """The scene of a plant: its mirrors in their poses, with the surfaces that its file specifies.
 
-What a caller asks for comes first, then the plant file, then the usual: a mirror that is focused at
-its slant range, with slope errors of 1 mrad.
+A caller's arguments take precedence over the plant file, and the plant file over the defaults: a
+mirror focused at its slant range, with slope errors of 1 mrad.
 """
 
 from collections.abc import Sequence
@@ -22,9 +22,9 @@ from heliotrope.mechanism.tracking import track
 from heliotrope.optics.scene import FacetTable, Mirrors, Scene
 from heliotrope.optics.surfaces import Surface, surface_of
 
-#: Slope error of mirrors of which nothing is known, rad.
+#: Slope error of mirrors about which nothing is known, rad.
 USUAL_SLOPE = 1e-3
-#: Reflectivity of mirrors of which nothing is known.
+#: Reflectivity of mirrors about which nothing is known.
 USUAL_REFLECTIVITY = 0.9
 #: A facet with a slope map is divided into at most this many parts each way.
 _PARTS = 8
@@ -51,20 +51,21 @@ def scene_of(
     Parameters
     ----------
     plant
-        As calibrated. Heliostats that cannot reach their aim shade and block, and are dark.
+        The plant, with its calibrated mechanisms. Heliostats that cannot reach their aim shade and
+        block, but send no light.
     sun
         Unit vector, (3,).
     aim
-        Aim points, ENU m, (3,) or (N, 3); None: each heliostat's own, else the middle of the
+        Aim points, ENU m, (3,) or (N, 3); None: each heliostat's own aim, or else the middle of the
         first receiver.
     receivers
-        Names in the plant, or surfaces; none: the plant's receivers.
+        Names of receivers of the plant, or surfaces; empty: all receivers of the plant.
     dni
         W/m².
     focus, slope, reflectivity
         As for `shaped`.
     towers
-        Obstacles beside those of the plant.
+        Obstacles in addition to the plant's towers.
     cells
         Rows and columns on each receiver; None: as `surface_of` chooses.
     **mirrors
@@ -75,7 +76,7 @@ def scene_of(
     InputError
         If the plant has no receiver, or shapes do not fit.
     UnknownNameError
-        If there is no receiver of a name.
+        If there is no receiver with one of the names.
     """
     light = as_vectors(sun, "sun")
     if light.shape != (3,):
@@ -138,14 +139,15 @@ def shaped(
     plant
         The plant.
     rows
-        Heliostat of each mirror, by its place in ``plant.names``, (H,); None: all in order.
+        Heliostat of each mirror, by its index in ``plant.names``, (H,); None: all heliostats in
+        order.
     focus
-        "plant": as the plant file specifies, otherwise each its distance to the aim; "slant": each
-        its distance to the aim; a focal length, m; infinity: flat. The tilts of facets stay, and
-        this is the focal length of each.
+        "plant": as the plant file specifies, or else "slant"; "slant": each mirror's distance to
+        its aim; a focal length, m; infinity: flat. Facets keep their tilts, and each facet gets
+        this focal length.
     slope, reflectivity
-        Slope error, rad, and reflectivity of the mirrors, () or (H,); None: of the plant file,
-        otherwise `USUAL_SLOPE`, or 0 with a slope map, and `USUAL_REFLECTIVITY`.
+        Slope error, rad, and reflectivity of the mirrors, () or (H,); None: the value in the plant
+        file, or else `USUAL_SLOPE` (0 with a slope map) and `USUAL_REFLECTIVITY`.
 
     Raises
     ------
@@ -171,18 +173,18 @@ def shaped(
     lengths = np.ones(len(plant))
     lengths[index] = focal
     table = _table(groups, lengths, own_focal=focus == "plant", own_slope=slope is None)
-    # The mirror's own focal length serves to cast what its neighbours hide.
+    # The mirror's own focal length is used only for casting the shadows of its neighbours.
     return replace(made, focal=_whole_focal(table)[index]).with_facets(table, np.asarray(index))
 
 
 def _mapped(group: Heliostats) -> npt.NDArray[np.bool_]:
-    """Return which mirrors of a group have a slope map, (N,)."""
+    """Return a mask of the mirrors of a group that have a slope map, (N,)."""
     maps = () if group.surface is None else group.surface.maps
     return np.array([slopes is not None for slopes in maps] or [False] * len(group), dtype=np.bool_)
 
 
 def _numbers(group: Heliostats) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return focal length (NaN: not known), slope error and reflectivity of each mirror, (N,)."""
+    """Return the focal length (NaN: unknown), slope error and reflectivity of each mirror, (N,)."""
     surface = group.surface or MirrorSurface()
     focal, slope = np.full(len(group), np.nan), np.where(_mapped(group), 0.0, USUAL_SLOPE)
     if surface.focal is not None and surface.focal.ndim == 1:
@@ -196,7 +198,7 @@ def _numbers(group: Heliostats) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class _Parts:
-    """Facets of some mirrors: centre, tilt, half size, curvature 1 / 2f and variance of slope."""
+    """Facets of some mirrors: centre, tilt, half size, curvature 1 / 2f and slope variance."""
 
     center: FloatArray
     tilt: FloatArray
@@ -205,7 +207,7 @@ class _Parts:
     variance: FloatArray
 
     def padded(self, most: int) -> "_Parts":
-        """Return as many facets of each mirror, the last of them empty."""
+        """Return the table padded with empty facets to a given number per mirror."""
         room = most - self.center.shape[1]
         sides = [((0, 0), (0, room), (0, 0))[: value.ndim] for value in vars(self).values()]
         return _Parts(*map(np.pad, vars(self).values(), sides))
@@ -214,7 +216,10 @@ class _Parts:
 def _table(
     groups: Sequence[Heliostats], focal: FloatArray, *, own_focal: bool, own_slope: bool
 ) -> FacetTable:
-    """Return the facets of all mirrors; ``focal`` (N,) of those whose own are not asked for."""
+    """Return the facets of all mirrors.
+
+    ``focal`` (N,) applies to mirrors whose own focal lengths are not used.
+    """
     parts, start = [], 0
     for group in groups:
         lengths = focal[start : start + len(group)]
@@ -252,10 +257,10 @@ def _facets(group: Heliostats, focal: FloatArray, *, own_focal: bool, own_slope:
 
 
 def _divided(mirror: _Parts, slopes: FloatArray) -> _Parts:
-    """Return one mirror's facets divided by a map of their slopes (F, H, W, 2).
+    """Return one mirror's facets, divided into parts by a slope map (F, H, W, 2).
 
-    Each part has the mean slope of the map's cells on it, and the curvature that fits them best;
-    what remains is its slope error.
+    Each part has the mean slope of the map cells on it, and the curvature that fits these cells
+    best; the residual is its slope error.
     """
     facets, height, width, _ = slopes.shape
     rows, columns = (np.arange(min(n, _PARTS)) * n // min(n, _PARTS) for n in (height, width))
@@ -289,7 +294,7 @@ def _divided(mirror: _Parts, slopes: FloatArray) -> _Parts:
 
 
 def _whole_focal(table: FacetTable) -> FloatArray:
-    """Return the focal length that best fits the normals of each mirror as a whole, m, (K,)."""
+    """Return the focal length that best fits each whole mirror's normals, m, (K,)."""
     area = table.half.prod(axis=-1)
     own = (table.half**2).sum(axis=-1) / 3.0
     lean = -(table.tilt * table.center).sum(axis=-1) + 0.5 / table.focal * own

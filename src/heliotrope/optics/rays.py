@@ -5,8 +5,8 @@ mirror, at a random point with a random slope error. It is traced backwards to a
 sun; an object on this path shades it. It is also reflected forwards; an object before a surface
 blocks it. The tracer is not meant for production, because 10⁷ rays take about half a minute.
 
-As in the engine, two effects are neglected: the sagitta of the mirrors, which count as flat when
-they obstruct their neighbours, and the shading of one surface by another.
+As in the engine, two effects are neglected: the sagitta of the mirrors, which are treated as flat
+when they obstruct their neighbours, and the shading of one surface by another.
 """
 
 from collections.abc import Callable
@@ -41,7 +41,7 @@ class RayTrace:
     Attributes
     ----------
     flux, error
-        Flux on each surface, W/m², and its standard error, in the shape of its cells.
+        Flux on each surface, W/m², and its standard error, in the shape of the surface's cells.
     power, power_error
         Power on each surface, W, and its standard error, (K,).
     cosine, shading, blocking, lit, intercept
@@ -166,10 +166,11 @@ class _Tracer:
         mirror, weight
             The mirror where each ray starts, and its power relative to the mean, (R,).
         shaded, blocked
-            (R,).
+            Masks of the shaded and the blocked rays, (R,).
         surface, cell
-            The surface and cell that it hits if it is not blocked; −1: none, (R,). A ray through
-            the aperture of a cavity hits the cavity, whether or not it then hits a cell.
+            The surface and the cell that each ray hits if it is not blocked, (R,); −1 if none. A
+            ray through the aperture of a cavity hits the cavity, whether or not it then hits a
+            cell.
         """
         m, k, rng, count = self.scene.mirrors, self.mirror[rows], self.rng, len(rows)
         place = (2.0 * rng.random((count, 2)) - 1.0) * self.half[rows]
@@ -208,7 +209,7 @@ class _Tracer:
         return np.asarray(hit >= 0)
 
     def _met(self, point: FloatArray, ray: FloatArray) -> tuple[Any, Any, FloatArray]:
-        """Return the first surface of each ray, its cell there, and the distance."""
+        """Return, for each ray, the first surface that it hits, the cell, and the distance."""
         surface = np.full(len(point), -1)
         cell, nearest = np.full(len(point), -1), np.full(len(point), np.inf)
         for j, receiver in enumerate(self.scene.surfaces):
@@ -220,7 +221,10 @@ class _Tracer:
     def _cell(
         self, surface: Surface, point: FloatArray, ray: FloatArray
     ) -> tuple[Any, FloatArray, Any]:
-        """Return the cell that each ray hits from its lit side, or −1, distance, and hit mask."""
+        """Return, for each ray, the cell that it hits, the distance, and whether it hits a cell.
+
+        A ray hits a cell only from the cell's lit side; the cell is −1 if it hits none.
+        """
         if isinstance(surface, Plate | Cylinder):
             on = _on_plate if isinstance(surface, Plate) else _on_cylinder
             cell, distance = on(surface, point, ray)  # type: ignore[arg-type]
@@ -251,7 +255,10 @@ def _on_plate(plate: Plate, point: FloatArray, ray: FloatArray) -> tuple[Any, Fl
 
 
 def _on_cylinder(pipe: Cylinder, point: FloatArray, ray: FloatArray) -> tuple[Any, FloatArray]:
-    """Return where rays enter a cylinder from outside."""
+    """Return the cell in which each ray enters a cylinder from outside, and the distance.
+
+    The cell is −1 if the ray does not enter.
+    """
     frame = np.stack([pipe.front, pipe.side, pipe.axis])
     p, d = (point - pipe.center) @ frame.T, ray @ frame.T
     a, b = np.sum(d[:, :2] ** 2, axis=-1), np.sum(p[:, :2] * d[:, :2], axis=-1)

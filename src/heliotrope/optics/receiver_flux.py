@@ -1,7 +1,7 @@
 r"""The flux of a field on its receivers, per mirror, kept up to date as mirrors move.
 
-The image of a mirror is that of its lit part (`shading`). The area, centroid and covariance C of
-the convex polygons are mapped through the mirror to the receiver as A C Aᵀ, where A is the
+The image of a mirror is the image of its lit part (`shading`). The area, centroid and covariance C
+of the convex polygons are mapped through the mirror to the receiver as A C Aᵀ, where A is the
 derivative of the ray's position with respect to the position on the mirror; A contains the
 astigmatism at the true angle of incidence. Covariances of the ray direction times the squared
 distance are added: the slope errors (4 σ² in the plane of incidence and 4 σ² cos² θ across it), the
@@ -77,12 +77,12 @@ class Efficiencies:
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """Flux of each of H mirrors alone at K aims, on a surface in columns.
+    """Flux of each of H mirrors by itself, at K aims, on a surface in columns.
 
     Attributes
     ----------
     values
-        W/m², one image after the other, each column by column, from below.
+        Flux, W/m², one image after the other; each image column by column, from below.
     begin
         Index at which each image begins, (H · K,), with the aims of a mirror in sequence.
     box
@@ -126,11 +126,11 @@ class FieldFlux:
     scene
         Mirrors, surfaces and sun.
     sun
-        Shape of the sun, or its name; see `SunShape`.
+        Sun shape, or the name of a sun shape; see `SunShape`.
     air
         Name of the attenuation model, or the visibility, km; see `air_loss`.
     gaussians
-        Number of Gaussians of the sun shape; the computing time is proportional to it.
+        Number of Gaussians for the sun shape; the computing time is proportional to this number.
 
     Raises
     ------
@@ -139,9 +139,10 @@ class FieldFlux:
 
     Notes
     -----
-    Against 10⁷ rays on a cylinder of 20 × 56 cells, whose own noise is 0.4 % of the peak, cells
-    differ by 0.41 % RMS (high sun) and 0.42 % (15°), and power by 0.002 % and 0.07 %; flat mirrors
-    by 0.65 % (noise 0.65 %) and 0.15 %.
+    Compared with 10⁷ traced rays on a cylinder of 20 × 56 cells, whose own noise is 0.4 % of the
+    peak, the cells differ by 0.41 % RMS (high sun) and 0.42 % (sun at 15°), and the power by 0.002
+    % and 0.07 %. For flat mirrors the cells differ by 0.65 % (noise 0.65 %), and the power by 0.15
+    %.
     """
 
     def __init__(
@@ -193,7 +194,7 @@ class FieldFlux:
         )  # fmt: skip
 
     def move(self, rows: IntArray, mirrors: Mirrors) -> IntArray:
-        """Move mirrors, and return the indices of all mirrors whose light has changed.
+        """Move mirrors; return the indices of all mirrors whose light has changed.
 
         Only the moved mirrors and those that they hide or no longer hide are computed again.
 
@@ -221,13 +222,13 @@ class FieldFlux:
         Parameters
         ----------
         aims
-            ENU m, (H, K, 3). Shading, blocking and attenuation remain those of the present aims,
-            and each mirror keeps its focal length.
+            ENU m, (H, K, 3). Shading, blocking and attenuation are those at the present aims, and
+            each mirror keeps its focal length.
         reach
             Number of additional rows of each image below and above the surface, so that it can be
             moved, (H,).
         gaussians
-            Number of Gaussians of the sun shape, if different from that of the flux.
+            Number of Gaussians for the sun shape, if it differs from the number used for the flux.
 
         Raises
         ------
@@ -270,16 +271,16 @@ class FieldFlux:
 
         Notes
         -----
-        The result is of first order in the errors.
+        The result is correct to first order in the errors.
         """
         plan, errors = self._in_columns(), (as_float(scatter), as_input(modes), as_input(worth))
         return plan.spread(self._field(), errors, groups)[:3]
 
     def power_slope(self) -> FloatArray:
-        """Return how the power of each mirror on the first surface changes with its beam.
+        """Return how a displacement of each mirror's beam changes its power on the first surface.
 
-        Derivatives with respect to a displacement to the right and up as seen from the mirror,
-        W/rad, (H, 2).
+        The result is the derivative with respect to a displacement to the right and up, as seen
+        from the mirror, W/rad, (H, 2).
 
         Raises
         ------
@@ -292,7 +293,7 @@ class FieldFlux:
         return plan.spread(self._field(), none, groups)[3]
 
     def on(self, surface: int) -> "FieldFlux":
-        """Return the same flux with another of its surfaces as the first and only one."""
+        """Return the same flux with one of the surfaces as the first and only surface."""
         single = copy(self)
         single.scene = replace(self.scene, surfaces=(self.scene.surfaces[surface],))
         for name in ("_plans", "_flux", "_power"):
@@ -320,7 +321,7 @@ class FieldFlux:
 
     @property
     def powers(self) -> list[float]:
-        """Power on each surface, W; into the aperture of a cavity."""
+        """Power on each surface, W; for a cavity, power into its aperture."""
         return [float(power[:, 1].sum()) for power in self._power]
 
     @property
@@ -405,7 +406,7 @@ class _Grid:
         flux += sums.sum(axis=0)
 
     def images(self, looks: int, field: Any, reach: IntArray) -> Images:
-        """Return single images; the mirror table in ``field`` has one row per image."""
+        """Return individual images; the mirror table in ``field`` has one row per image."""
         low, step, rows, area = self._grid
         most, count = int(reach.max(initial=0)), len(field[0])
         tall = (low - most * step, step, rows + 2 * most, area)
@@ -531,7 +532,7 @@ def _light(scene: Scene, transmitted: FloatArray) -> FloatArray:
 
 
 def _figure(mirrors: Mirrors) -> FloatArray:
-    """Return tilt (2), curvature 1 / 2f and variance of slope of each facet, (K, F, 4)."""
+    """Return the tilt (2), curvature 1 / 2f and slope variance of each facet, (K, F, 4)."""
     facets = mirrors.facets
     if facets is None:
         return as_input(np.empty((0, 0, 4)))
@@ -541,7 +542,7 @@ def _figure(mirrors: Mirrors) -> FloatArray:
 
 
 def _divisions(scene: Scene, sun: float = SUN_SIGMA**2) -> IntArray:
-    """Return columns and rows of parts of each mirror, so that part images are narrow, (H, 2)."""
+    """Return the columns and rows of parts that make each mirror's part images narrow, (H, 2)."""
     mirrors, cosine = scene.mirrors, scene.incidence
     count = np.ones((len(mirrors), 2), dtype=np.int64)
     if mirrors.facets is not None:
@@ -558,7 +559,10 @@ def _divisions(scene: Scene, sun: float = SUN_SIGMA**2) -> IntArray:
 
 
 def _root(covariance: FloatArray) -> FloatArray:
-    """Return the lower roots of covariances (N, 2, 2), which may be singular: (N, 3)."""
+    """Return the lower triangular roots, (N, 3), of covariances (N, 2, 2).
+
+    The covariances may be singular.
+    """
     first = np.sqrt(np.maximum(covariance[:, 0, 0], 0.0))
     mixed = np.divide(covariance[:, 1, 0], first, out=np.zeros_like(first), where=first > 0.0)
     # Rounding may make a singular covariance slightly negative.

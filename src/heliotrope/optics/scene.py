@@ -35,15 +35,15 @@ class FacetTable:
     center
         Centre, right and up in the mirror's plane, m, (K, F, 2).
     tilt
-        Canting: x and y of the facet's normal in the mirror's axes, whose z is near 1, rad,
+        Canting: x and y components of the facet's normal in the mirror's axes (z is near 1), rad,
         (K, F, 2).
     half
         Half width and half height, m, (K, F, 2); 0 where a mirror has fewer facets.
     focal
         Focal length of the facet's own curvature, m; infinite if flat, negative if convex, (K, F).
     slope
-        Standard deviation of the facet's normal per axis, rad, (K, F), in addition to that of its
-        mirror (the variances add); None: 0.
+        Standard deviation of the facet's normal per axis, rad, (K, F). It comes in addition to the
+        mirror's own value (the variances add); None: 0.
     """
 
     center: FloatArray
@@ -75,7 +75,7 @@ class Mirrors:
     center, normal, right, up
         Centre, ENU m, unit normal and axes in the plane, (H, 3); right × up = normal.
     width, height
-        Along the axes, m, (H,).
+        Size along the axes, m, (H,).
     focal
         Focal length of the whole mirror, from curvature and canting, m, (H,); infinite if flat.
     aim
@@ -125,7 +125,7 @@ class Mirrors:
         Parameters
         ----------
         center, normal, aim
-            As the attributes.
+            As for the attributes.
         size
             Width and height, m.
         right
@@ -164,7 +164,7 @@ class Mirrors:
 
     @property
     def area(self) -> FloatArray:
-        """Reflecting area, m², (H,): that of the facets if there are any."""
+        """Reflecting area, m², (H,): the area of the facets if there are any."""
         if self.facets is None:
             return as_float(self.width * self.height)
         return as_float((4.0 * self.facets.half.prod(axis=-1)).sum(axis=-1)[self.kind])
@@ -175,7 +175,7 @@ class Mirrors:
         return as_float(np.linalg.norm(self.aim - self.center, axis=-1))
 
     def with_numbers(self, **numbers: npt.ArrayLike) -> "Mirrors":
-        """Return the mirrors with other numbers, each () or (H,).
+        """Return the mirrors with some numbers replaced, each () or (H,).
 
         Parameters
         ----------
@@ -197,7 +197,7 @@ class Mirrors:
         return replace(self, **own)
 
     def toward(self, sun: FloatArray, aim: npt.ArrayLike) -> "Mirrors":
-        """Return the mirrors rotated about their centres to reflect the sun to other aims.
+        """Return the mirrors rotated about their centres so that they reflect the sun to new aims.
 
         Parameters
         ----------
@@ -216,7 +216,7 @@ class Mirrors:
     def with_facets(
         self, facets: FacetTable, kind: npt.NDArray[np.int64] | None = None
     ) -> "Mirrors":
-        """Return the mirrors with facets; ``kind`` may be left out if K is 1 or H.
+        """Return the mirrors with given facets; ``kind`` may be omitted if K is 1 or H.
 
         Raises
         ------
@@ -257,11 +257,11 @@ class Scene:
     mirrors
         Mirrors in their poses. Mirrors in ``dark`` shade and block, but send no light.
     surfaces
-        Receivers and targets; a beam is caught by the first that it meets.
+        Receivers and targets; a beam is caught by the first surface that it meets.
     towers
         Obstacles, except those that belong to a surface.
     dark
-        Mask of the mirrors whose beams do not count, (H,).
+        Mask of the mirrors whose beams are ignored, (H,).
     """
 
     sun: FloatArray

@@ -2,9 +2,9 @@ r"""Shading and blocking: which part of each mirror sees the sun, and its aim.
 
 The outlines of the mirrors (and towers) in front are projected along the rays into the mirror
 plane, and subtracted from the mirror as convex polygons (Sutherland and Hodgman 1974,
-Communications of the ACM 17, 32). Overlapping areas therefore count exactly once, and the number of
-occluders is unlimited. For shading the rays are parallel; for blocking, the rays of a curved or
-canted mirror converge:
+Communications of the ACM 17, 32). Overlapping areas are therefore counted exactly once, and the
+number of occluders is unlimited. For shading the rays are parallel; for blocking, the rays of a
+curved or canted mirror converge:
 
 $$d(x, y) = d_0 + 2 (δn·s) n + 2 (n·s) δn, \qquad δn = -(x, y) / 2f.$$
 
@@ -46,10 +46,10 @@ class Lit:
     shading, blocking, both
         Fractions of the mirror's area that are not shaded, not blocked, and neither, (H,).
     moments
-        Moments of the lit part of each part of a mirror: area, centroid (x, y) and covariance (xx,
+        Moments of the lit area of each part of a mirror: area, centroid (x, y) and covariance (xx,
         xy, yy) in the mirror's axes, m² and m, (P, 6).
     begin
-        Row of ``moments`` where each mirror's parts begin, (H + 1,).
+        Index in ``moments`` at which each mirror's parts begin, (H + 1,).
     """
 
     shading: FloatArray
@@ -67,8 +67,8 @@ class Shading:
     scene
         Mirrors, towers and sun.
     split
-        Columns and rows of equal parts whose moments are to be computed, (H, 2); the parts of
-        mirrors with facets are the facets. None: one part.
+        Columns and rows of equal parts whose moments are to be computed, (H, 2). If a mirror has
+        facets, these are its parts. None: each mirror is one part.
     """
 
     def __init__(self, scene: Scene, split: IntArray | None = None) -> None:
@@ -86,7 +86,7 @@ class Shading:
 
     @property
     def lit(self) -> Lit:
-        """The present state; its arrays change with `move`."""
+        """The present state; `move` changes its arrays."""
         shading, blocking, both = self._shares.T
         return Lit(shading, blocking, both, self._moments, self.parts[3])
 
@@ -105,7 +105,7 @@ class Shading:
         self._spans, self._near = self._candidates(np.arange(len(table)))
 
     def _candidates(self, rows: IntArray) -> tuple[IntArray, IntArray]:
-        """Return the parts (R, 3) of a list of candidates of the mirrors in ``rows``."""
+        """Return where the candidates of the mirrors in ``rows`` lie in the list, (R, 3)."""
         found: dict[int, tuple[IntArray, IntArray]] = {}
 
         def block(first: int, last: int) -> None:
@@ -135,12 +135,12 @@ class Shading:
         run_blocks(block, len(rows))
 
     def move(self, rows: IntArray, mirrors: Mirrors) -> IntArray:
-        """Move mirrors, and return the rows of all whose light has changed.
+        """Move mirrors; return the indices of all mirrors whose light has changed.
 
         Parameters
         ----------
         rows
-            Which moved, (M,).
+            Indices of the moved mirrors, (M,).
         mirrors
             All mirrors, (H,), in their new poses.
         """
@@ -165,7 +165,7 @@ class Shading:
         return np.flatnonzero(changed)
 
     def _replace(self, rows: IntArray) -> None:
-        """Find the candidates of some mirrors again."""
+        """Find the candidates of some mirrors anew."""
         spans, near = self._candidates(rows)
         self._spans[rows] = spans + len(self._near)
         self._near = np.concatenate([self._near, near])
@@ -174,7 +174,7 @@ class Shading:
             self._spans, self._near = self._candidates(np.arange(len(self.table)))
 
     def _touched(self, rows: IntArray) -> npt.NDArray[np.bool_]:
-        """Return the mask of mirrors that are in ``rows`` or have one of them as candidate."""
+        """Return a mask of the mirrors that are in ``rows`` or have one of these as a candidate."""
         moved = np.zeros(len(self.table), dtype=np.bool_)
         moved[rows] = True
         touched = np.empty_like(moved)
@@ -182,7 +182,7 @@ class Shading:
         return touched
 
     def pieces(self, row: int) -> list[FloatArray]:
-        """Return the convex polygons that make up the lit part of one mirror, m, (k, 2) each."""
+        """Return the convex polygons that make up the lit part of one mirror, m, each (k, 2)."""
         corners, begins = kernels.pieces_of(
             row, self.table, self._towers, self._sun, as_input(self._ways), self._reaches,
             self._near, self._spans,
@@ -207,7 +207,7 @@ def nearest(places: FloatArray, count: int = NEAREST) -> npt.NDArray[np.intp]:
 
 
 def parts_of(begin: IntArray, rows: IntArray) -> IntArray:
-    """Return the rows of the parts of some mirrors; ``begin`` (H + 1,) as in `Lit`."""
+    """Return the indices of the parts of some mirrors; ``begin`` (H + 1,) is as in `Lit`."""
     counts = begin[rows + 1] - begin[rows]
     ends = np.cumsum(counts)
     first = np.repeat(begin[rows] - ends + counts, counts)
@@ -217,7 +217,7 @@ def parts_of(begin: IntArray, rows: IntArray) -> IntArray:
 def _rows(
     mirrors: Mirrors, sun: FloatArray, rows: IntArray | slice = slice(None)
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the kernels' table, the central rays and how far they are followed."""
+    """Return the table for the kernels, the central rays, and how far these are followed."""
     center, normal = mirrors.center[rows], mirrors.normal[rows]
     table = table_of(mirrors, rows)
     ways = reflect(np.broadcast_to(sun, normal.shape), normal)
@@ -226,7 +226,7 @@ def _rows(
 
 
 def table_of(mirrors: Mirrors, rows: IntArray | slice = slice(None)) -> FloatArray:
-    """Return the kernels' table of mirrors: poses, half sizes, curvature and radius."""
+    """Return the mirror table for the kernels: poses, half sizes, curvatures and radii."""
     half = 0.5 * np.stack([mirrors.width[rows], mirrors.height[rows]], axis=-1)
     curve, radius = 0.5 / mirrors.focal[rows], np.linalg.norm(half, axis=-1)
     axes = (mirrors.right[rows], mirrors.up[rows], mirrors.normal[rows])
@@ -234,7 +234,7 @@ def table_of(mirrors: Mirrors, rows: IntArray | slice = slice(None)) -> FloatArr
 
 
 def _parts(mirrors: Mirrors, split: IntArray) -> Any:
-    """Return facets, their kinds, the divisions, and where each mirror's parts begin."""
+    """Return the facets, their kinds, the divisions, and where each mirror's parts begin."""
     facets = mirrors.facets
     if facets is None:
         counts = split.prod(axis=1)

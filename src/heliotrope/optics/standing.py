@@ -1,4 +1,4 @@
-"""Beams of heliostats at rest: over all sun positions of the year, and superposed in the air."""
+"""Beams of heliostats at rest: over all sun positions of the year, and their superposition."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,25 +11,30 @@ from heliotrope.geometry import FloatArray, as_float, normalize, reflect
 from heliotrope.optics.beam import SUN_RADIUS, Beams, MirrorOptics, crossing
 from heliotrope.optics.keep_out import bounds, find_entries
 
-#: Largest declination of the sun, rad, and room for refraction, which lifts a sun at the horizon.
+#: Largest declination of the sun, rad, and allowance for refraction, which lifts the sun at the
+#: horizon.
 _TROPIC, _REFRACTION = float(np.radians(23.45)), float(np.radians(0.6))
-#: Angle between neighbouring suns of the year, rad; no sun is further than 0.71 of it from one.
+#: Angle between neighbouring sun positions of the year, rad; no sun position is further than 0.71
+#: of this angle from a computed one.
 _STEP = float(np.radians(1.0))
-#: Points at which `hottest` asks for the light of all beams, at first.
+#: Number of points at which `hottest` first computes the irradiance from all beams.
 _POINTS = 1000
-#: Points of each beam on both sides of the place, and steps of the search about the hottest, m.
+#: Number of points of each beam on both sides of the place, and steps of the search about the
+#: hottest point, m.
 _ALONG, _COARSE, _FINE = 25, 4.0, 0.2
 #: Pairs of a point and a beam that are computed at once.
 _PAIRS = 200_000
 
 
 def suns_of_the_year(latitude: float) -> FloatArray:
-    """Return unit vectors (S, 3), ENU, to all suns above the horizon, about 1° apart.
+    """Return unit vectors, ENU, (S, 3), to all sun positions of the year above the horizon.
+
+    The sun positions are about 1° apart.
 
     Parameters
     ----------
     latitude
-        rad, north positive.
+        Latitude, rad, north positive.
     """
     declination = np.arange(-_TROPIC, _TROPIC + _STEP, _STEP)
     hour = np.arange(-np.pi, np.pi, _STEP)
@@ -49,9 +54,10 @@ def entered_over_the_year(
     latitude: float,
     reach: float,
 ) -> npt.NDArray[np.bool_]:
-    """Return whether the beam of each standing mirror enters each volume in a year, (N, V).
+    """Return whether the beam of each mirror at rest enters each volume in a year, (N, V).
 
-    "Clear" is proven as in `keep_out`: each beam is widened by what lies between neighbouring suns.
+    As in `keep_out`, a result of "clear" is certain, because each beam is widened to cover the sun
+    positions between the computed ones.
 
     Parameters
     ----------
@@ -62,9 +68,9 @@ def entered_over_the_year(
     volumes
         V volumes.
     latitude
-        rad, north positive.
+        Latitude, rad, north positive.
     reach
-        Length over which a beam is followed, m.
+        Distance up to which the beams are followed, m.
     """
     entered = np.zeros((len(vertex), len(volumes)), dtype=np.bool_)
     suns = suns_of_the_year(latitude)
@@ -73,7 +79,7 @@ def entered_over_the_year(
         path = center - vertex
         distance = np.linalg.norm(path, axis=-1)
         share = (radius + mirrors.half_diagonal) / np.maximum(distance, 1e-9)
-        # All suns whose beams may touch the ball about the volume are in this cone.
+        # All sun positions whose beams may touch the sphere about the volume are in this cone.
         room = np.arcsin(np.minimum(share, 1.0)) + wide.spread
         room = np.where(share >= 1.0, np.pi, room)
         toward = reflect(normalize(path, "center - vertex"), normal)
@@ -94,7 +100,7 @@ def _enters(
     volume: Volume,
     reach: float,
 ) -> bool:
-    """Return whether the beam of one mirror enters a volume with one of the suns (S, 3)."""
+    """Return whether the beam of one mirror enters a volume at any of the sun vectors (S, 3)."""
     count = len(suns)
     mirror = MirrorOptics(
         **{k: np.repeat(v[row : row + 1], count) for k, v in vars(mirrors).items()}
@@ -122,7 +128,7 @@ def standing_beams(
     mirrors
         N mirrors.
     reach
-        Length over which they are followed, m.
+        Distance up to which the beams are followed, m.
     """
     rays = np.ascontiguousarray(reflect(np.broadcast_to(sun, normal.shape), normal))
     return Beams(np.ascontiguousarray(vertex), rays, mirrors, np.full(len(vertex), reach))
@@ -130,16 +136,18 @@ def standing_beams(
 
 @dataclass(frozen=True)
 class Hottest:
-    """The place where the beams of a field together are strongest.
+    """The place where the beams of a field, taken together, are strongest.
 
     Attributes
     ----------
     suns
-        Irradiance on a surface that faces each beam, over that of the sun.
+        Sum of the beams' irradiances, each on a surface that faces the beam, as a multiple of the
+        direct sun.
     point
         ENU, m, (3,).
     reach
-        Largest distance from the centre at which more than the limit was found, m; 0: nowhere.
+        Largest distance from the centre at which more than the limit was found, m; 0 if it was
+        found nowhere.
     """
 
     suns: float
@@ -148,10 +156,10 @@ class Hottest:
 
 
 def hottest(beams: Beams, center: FloatArray, around: float, limit: float = 10.0) -> Hottest:
-    """Return where beams are strongest together, near a place in the air.
+    """Return where beams, taken together, are strongest near a place in the air.
 
-    Points on the beams' axes are asked first, evenly chosen, then the neighbourhood of the best of
-    them: a narrow peak between them may be missed.
+    First, evenly spaced points on the beams' axes are evaluated, then the neighbourhood of the best
+    of these points. A narrow peak between the points may be missed.
 
     Parameters
     ----------
@@ -160,9 +168,9 @@ def hottest(beams: Beams, center: FloatArray, around: float, limit: float = 10.0
     center
         The middle of the search, such as a receiver's, ENU, m, (3,).
     around
-        How far from it each beam is followed, m.
+        Distance from the centre up to which each beam is followed, m.
     limit
-        Suns of `Hottest.reach`.
+        Limit for `Hottest.reach`, in suns.
     """
     near = np.einsum("nk,nk->n", center - beams.origin, beams.direction)
     points = beams.point(near[:, None] + np.linspace(-around, around, _ALONG)).reshape(-1, 3)
@@ -187,6 +195,6 @@ def hottest(beams: Beams, center: FloatArray, around: float, limit: float = 10.0
 
 
 def _suns(beams: Beams, points: FloatArray) -> FloatArray:
-    """Return the light of all beams at points (P, 3), in suns, (P,)."""
+    """Return the irradiance from all beams at points (P, 3), in suns, (P,)."""
     parts = np.array_split(points, 1 + len(points) * len(beams) // _PAIRS)
     return np.concatenate([crossing(beams, part, dni=1.0).irradiance for part in parts])

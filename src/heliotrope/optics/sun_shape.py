@@ -10,7 +10,7 @@ With x = θ / 4.65 mrad and μ = √(1 − x²), on the disk (x ≤ 1):
 - `buie`: cos 0.326θ / cos 0.308θ on the disk and e^κ θ^γ around it to 43.6 mrad, θ in mrad, with κ
   = 0.9 ln(13.5 χ) χ^−0.3 and γ = 2.2 ln(0.52 χ) χ^0.43 − 0.1 (Buie, Monger and Dey, Solar Energy 74
   (2003) 113-122). Buie's χ is only approximately the fraction of the light that comes from around
-  the disk; `SunShape` takes that fraction, the circumsolar ratio, and solves for χ.
+  the disk. `SunShape` is specified by this fraction, the circumsolar ratio, and solves for χ.
 
 A mirror blurs the sun, so a short sum of Gaussians with the sun's exact variance is as good as the
 profile itself (`SunShape.gaussians`). A disk has weaker tails than a Gaussian, so one of the
@@ -92,7 +92,7 @@ class SunShape:
 
     @classmethod
     def of(cls, shape: "str | SunShape") -> Self:
-        """Return a shape from its name, or from "buie:0.1" and "gaussian:0.0027" with a number.
+        """Return a shape from its name, which may contain a number: "buie:0.1", "gaussian:0.0027".
 
         Raises
         ------
@@ -136,7 +136,7 @@ class SunShape:
 
     @cached_property
     def _nodes(self) -> tuple[FloatArray, FloatArray]:
-        """Angles and the fractions of the light at them, (M,), for integrals."""
+        """Angles, and the fraction of the light at each angle, (M,), for integrals."""
         theta, weight = _quadrature(self.radius)
         share = weight * theta * self.radiance(theta)
         return theta, as_float(share / share.sum())
@@ -149,7 +149,7 @@ class SunShape:
 
     @cached_property
     def _table(self) -> tuple[FloatArray, FloatArray]:
-        """Fraction of the light within angles, and these angles."""
+        """Fractions of the light within some angles, and these angles."""
         edges = np.linspace(0.0, self.radius, _TABLE)
         edges = np.unique(np.append(edges, np.linspace(0.0, SUN_RADIUS, _TABLE)))
         middle = 0.5 * (edges[1:] + edges[:-1])
@@ -179,8 +179,9 @@ class SunShape:
             Number of Gaussians; a Gaussian sun needs only one.
         blur
             Standard deviation per axis of an additional Gaussian that blurs the images before they
-            are compared, rad, for example from slope errors of half that size. It is rounded to 0.1
-            mrad and limited to 0.3 to 3 mrad. For wider blurs the sum fits even better.
+            are compared, rad, for example from slope errors of half the size of ``blur``. It is
+            rounded to 0.1 mrad and limited to 0.3 to 3 mrad. For wider blurs the sum fits even
+            better.
 
         Raises
         ------
@@ -201,7 +202,7 @@ class SunShape:
         return _fitted(self, count, round(float(np.clip(blur, *_BLURS)), 4))
 
     def spectrum(self, frequency: npt.ArrayLike) -> FloatArray:
-        """Return the Fourier transform of the image, 1 at 0, at angular frequencies, 1/rad."""
+        """Return the Fourier transform of the image at angular frequencies, 1/rad; it is 1 at 0."""
         from scipy.special import j0
 
         theta, share = self._nodes
@@ -236,7 +237,7 @@ def sun_profile(theta: npt.ArrayLike, shape: str, circumsolar: float = 0.05) -> 
     theta
         Angles from the centre, (...).
     shape
-        "pillbox", "limb", "quartic" or "buie"; see the module for their formulae.
+        "pillbox", "limb", "quartic" or "buie"; see the module docstring for their formulae.
     circumsolar
         Buie's χ.
 
@@ -267,7 +268,7 @@ def sun_profile(theta: npt.ArrayLike, shape: str, circumsolar: float = 0.05) -> 
 
 @lru_cache(maxsize=8)
 def _quadrature(radius: float) -> tuple[FloatArray, FloatArray]:
-    """Return nodes and weights from 0 to a radius, with a break at the rim of the disk."""
+    """Return integration nodes and weights from 0 to a radius, with a break at the disk's rim."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     ends = [0.0, min(radius, SUN_RADIUS), radius]
     parts = [(a, b) for a, b in pairwise(ends) if b > a]
@@ -290,7 +291,10 @@ def _chi(csr: float) -> float:
 
 
 def _frequencies(blur: float, count: int = 400) -> tuple[FloatArray, FloatArray]:
-    """Return nodes and weights in angular frequency, up to where a blur leaves nothing, 1/rad."""
+    """Return nodes and weights in angular frequency, 1/rad.
+
+    They extend up to the frequency beyond which a blur leaves nothing.
+    """
     nodes, weights = np.polynomial.legendre.leggauss(count)
     top = 6.0 / blur
     return as_float(0.5 * top * (nodes + 1.0)), as_float(0.5 * top * weights)
@@ -302,7 +306,9 @@ def _sum(parts: Gaussians, k: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _fitted(shape: SunShape, count: int, blur: float) -> Gaussians:
-    """Return the fit in the frequency domain, where the squared difference is the same.
+    """Return the fit, computed in the frequency domain.
+
+    The integral of the squared difference is the same there.
 
     Two weights follow from the sum and the variance, and the remaining ones are linear; the
     variances are searched for from a few starting points.
@@ -331,7 +337,8 @@ def _fitted(shape: SunShape, count: int, blur: float) -> Gaussians:
         # Nearly equal Gaussians with huge weights of opposite sign are of no benefit.
         return float(rest @ rest / (true * root @ (true * root)) + 3e-6 * w @ w)
 
-    # Starts for the disk alone, near and far from each other, and with one or two for an aureole.
+    # Starting points: for the disk alone, near and far from each other; and with one or two for an
+    # aureole.
     disk = np.log(SUN_SIGMA**2 / total)
     near, far = (disk + np.linspace(np.log(a), np.log(0.8), count) for a in (0.45, 0.2))
     begins = [near, far, np.append(far[1:], 2.0), np.append(near[:-1], 1.0)]

@@ -44,7 +44,7 @@ class Plate:
     Attributes
     ----------
     name
-        Of the receiver or target.
+        Name of the receiver or target.
     center, right, up
         Centre, ENU m, and unit axes in the plane as seen from the front, (3,).
     width, height
@@ -71,7 +71,7 @@ class Plate:
 
     @cached_property
     def corners(self) -> FloatArray:
-        """Lower left, lower right, upper right, upper left, ENU m, (4, 3)."""
+        """Lower left, lower right, upper right and upper left corners, ENU m, (4, 3)."""
         across, along = 0.5 * self.width * self.right, 0.5 * self.height * self.up
         signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
         return np.stack([self.center + a * across + b * along for a, b in signs])
@@ -97,7 +97,7 @@ class Cylinder:
     Attributes
     ----------
     name
-        Of the receiver.
+        Name of the receiver.
     center
         Midpoint of the axis, ENU m, (3,).
     axis, front
@@ -127,16 +127,16 @@ class Cylinder:
 
     @property
     def side(self) -> FloatArray:
-        """Unit vector at a quarter turn clockwise from ``front``, (3,): east for a full one."""
+        """Unit vector a quarter turn clockwise from ``front``, (3,); east for a full cylinder."""
         return as_float(np.cross(self.front, self.axis))
 
     @property
     def edges(self) -> FloatArray:
-        """Angles of the columns' edges, rad, (columns + 1,)."""
+        """Angles of the column edges, rad, (columns + 1,)."""
         return np.linspace(*self.span, self.shape[1] + 1)
 
     def outward(self, angle: FloatArray) -> FloatArray:
-        """Return unit normals at angles (...), (..., 3)."""
+        """Return the unit normals at angles (...), (..., 3)."""
         a = as_float(angle)[..., None]
         return as_float(np.cos(a) * self.front + np.sin(a) * self.side)
 
@@ -163,7 +163,7 @@ class Mesh:
     Attributes
     ----------
     name
-        Of the receiver.
+        Name of the receiver.
     vertices
         ENU m, (V, 3).
     faces
@@ -202,7 +202,7 @@ class Mesh:
 
     @cached_property
     def cells(self) -> Cells:
-        """The triangles."""
+        """The triangles as cells."""
         a, b, c = np.moveaxis(self.corners, 1, 0)
         cross = np.cross(b - a, c - a)
         length = np.linalg.norm(cross, axis=-1)
@@ -227,7 +227,7 @@ class Cavity:
 
     @property
     def name(self) -> str:
-        """Name of the receiver, which is that of the aperture."""
+        """Name of the receiver, which is the name of the aperture."""
         return self.aperture.name
 
     @property
@@ -251,8 +251,9 @@ def surface_of(item: Receiver | Target, shape: tuple[int, int] | None = None) ->
     Parameters
     ----------
     item
-        A planar receiver or target becomes a plate, a cylinder or a sector of one becomes a
-        cylinder. The triangles of a mesh, or of a cavity's inner surface, are its cells.
+        The receiver or target. A planar one becomes a plate; a cylinder, or a sector of a cylinder,
+        becomes a cylinder. The triangles of a mesh, or of a cavity's inner surface, become its
+        cells.
     shape
         Rows and columns; None: `PLATE_CELLS` or `CYLINDER_CELLS`.
     """

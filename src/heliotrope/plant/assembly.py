@@ -73,7 +73,7 @@ _PLANT_FILE = Person("plant file", Role.ENGINEER)
 
 
 class MachineTables(Enum):
-    """Whether the local controllers hold the machine tables of the plant file."""
+    """Whether the local controllers store the machine tables of the plant file."""
 
     #: Unknown: the controllers keep the tables that they hold, and the plant assumes nothing.
     UNKNOWN = "unknown"
@@ -96,7 +96,7 @@ class AssemblySettings:
     cycle
         Calibration.
     machines
-        Whether the local controllers hold the plant file's machine tables.
+        Whether the local controllers store the plant file's machine tables.
     """
 
     work: AutomaticSettings = field(default_factory=AutomaticSettings)
@@ -106,7 +106,10 @@ class AssemblySettings:
 
 
 class _Begun:
-    """Operations that begin once the field is ready; the plant already controls it before."""
+    """Operations that begin once the field is ready.
+
+    The plant controls the field before they begin.
+    """
 
     def __init__(
         self, operations: Operations, ready: Callable[[], Coroutine[Any, Any, None]] | None
@@ -209,7 +212,7 @@ class PlantAssembly:
     def _record_limits(self) -> None:
         """Record which limits of the safety table and of approvals differ from the previous run.
 
-        At the first run they are compared with the defaults.
+        At the first run the limits are compared with the defaults.
         """
         if self.ports.records is None:
             return
@@ -252,12 +255,12 @@ class PlantAssembly:
         )
 
     def _rest_on_machines(self) -> None:
-        """Set the standby points of the plant file for heliostats to which none was assigned."""
+        """Set the plant file's standby points for heliostats without an assigned standby point."""
         for row, name in enumerate(self.names):
             rest_on(self.plant.standbys[row : row + 1], self.design.machine(name).standby)
 
     def aim_as_designed(self) -> None:
-        """Set the design's aims for heliostats to which none was assigned; they track them."""
+        """Set the design's aims for heliostats without an assigned aim; they then track them."""
         aims = self.plant.default_aims(self.names)
         for row, name in enumerate(self.names):
             rest_on(self.plant.aims[row : row + 1], tuple(aims[name]))
@@ -274,7 +277,7 @@ class PlantAssembly:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator["PlantAssembly"]:
-        """Run the plant, its operations and everything beside them for the duration of a block."""
+        """Run the plant, its operations and all accompanying tasks for the duration of a block."""
         cameras, sensors = self.ports.cameras, self.ports.sensors
         if cameras is not None:
             cameras.start(self.logbook.take_alarm)
@@ -321,7 +324,7 @@ class PlantAssembly:
             await asyncio.sleep(_SENSED)
 
     async def _witness(self) -> None:
-        """Compare the plant's sun vector with those of its witnesses as they arrive."""
+        """Compare the plant's sun vector with the witnesses' sun vectors as they arrive."""
         while True:
             for witness in self.ports.witnesses:
                 seen = await witness.sun(self.design.site)
@@ -351,8 +354,8 @@ class PlantAssembly:
     async def stowed(self, limit: float = 300.0) -> bool:
         """Stow the field; return whether every heliostat is stowed.
 
-        It waits ``limit`` s at most, and only for heliostats on their way (`to_stow`); `left` names
-        all others.
+        The call waits ``limit`` s at most, and only for heliostats on their way (`to_stow`); `left`
+        names all heliostats that are not stowed.
         """
         await self.operations.automatic.halt()
         ticket, rows = self.plant.stow("plant's end"), self.plant.field
@@ -366,7 +369,7 @@ class PlantAssembly:
         return not self.left()
 
     def _on_the_way(self, now: float) -> npt.NDArray[np.bool_]:
-        """Return the heliostats that an order sends to stow and that are not there yet, (N,)."""
+        """Return a mask of the heliostats that are on their way to stow by an order, (N,)."""
         rows = self.plant.field
         away = (rows.age(now) <= SILENT) & ~(rows.live(now) & at_stow(rows.rows))
         # In these states, only the motion shows whether a heliostat obeys STOW.
@@ -374,13 +377,13 @@ class PlantAssembly:
         return np.asarray(away & ~stands)
 
     def to_stow(self) -> tuple[dict[str, int], float]:
-        """Return the heliostats on their way to stow, and about how long they take.
+        """Return the heliostats on their way to stow, and about how long they will take.
 
         Returns
         -------
-            Their number in each state; and the time, s, in which both axes of the furthest
-            heliostat turn, one after the other, once the heliostats before it have been sent. NaN
-            if their positions are unknown.
+            Their number in each state; and the time, s, that the furthest heliostat needs to turn
+            both axes, one after the other, once the heliostats before it have been sent. NaN if the
+            positions are unknown.
         """
         rows, now = self.plant.field, self.clock.monotonic()
         away = np.flatnonzero(self._on_the_way(now))
@@ -396,7 +399,7 @@ class PlantAssembly:
         return dict(found.most_common()), seconds
 
     def left(self) -> str:
-        """Return the heliostats that are not stowed, in words; empty if all are stowed."""
+        """Return the heliostats that are not stowed, in words; "" if all are stowed."""
         rows, now = self.plant.field, self.clock.monotonic()
         away = np.flatnonzero(~(rows.live(now) & at_stow(rows.rows)))
         if not len(away):
@@ -411,7 +414,7 @@ class PlantAssembly:
 
 
 class _WhereAwake:
-    """A schedule that leaves out targets whose camera is silent."""
+    """A schedule that omits targets whose camera is silent."""
 
     def __init__(self, schedule: Scheduling, cameras: Cameras) -> None:
         self._schedule, self._cameras = schedule, cameras

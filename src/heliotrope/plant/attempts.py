@@ -1,4 +1,4 @@
-"""Attempts: what automatic control retries, how often, and what follows.
+"""Attempts: what automatic control retries, how often, and what happens after the last failure.
 
 Work that may fail is retried by one rule: each consecutive failure lengthens the wait, and after
 the last attempt the work is *given up* with an alarm that names the reason and the next step.
@@ -18,7 +18,7 @@ from heliotrope.safety import Alarm, alarms
 
 @dataclass(frozen=True)
 class RetryLaw:
-    """How one kind of work is retried.
+    """The rule by which one kind of work is retried.
 
     Attributes
     ----------
@@ -27,9 +27,11 @@ class RetryLaw:
     most
         Number of consecutive failures after which it is given up.
     wait, growth, longest
-        Wait after the first failure, s, the factor from one to the next, and the longest wait, s.
+        Wait after the first failure, s; the factor by which each further wait grows; and the
+        longest wait, s.
     rest
-        Time until work that was given up is tried once more, s; infinite: never by itself.
+        Time until work that was given up is tried once more, s; infinite: it is not tried again
+        automatically.
     memory
         Time after which an earlier failure no longer counts, s.
     following
@@ -62,8 +64,7 @@ class Retry:
     reason
         Why it failed last.
     left
-        Time until the next attempt, s; 0: at the next opportunity; infinite: there is none by
-        itself.
+        Time until the next attempt, s; 0: at the next opportunity; infinite: no automatic attempt.
     given_up
         Whether it was given up.
     following
@@ -82,7 +83,7 @@ class Retry:
 
 @dataclass(frozen=True)
 class _Failed:
-    """Failures of one subject: their number, the last reason and time, and the next attempt."""
+    """Failures of one subject: their number, the last reason, its time, and the next attempt."""
 
     count: int
     reason: str
@@ -113,7 +114,7 @@ class Attempts:
     # -- results ---------------------------------------------------------------------------
 
     def failed(self, subject: str, reason: str, now: float) -> None:
-        """Note a failure; after the last one the work is given up."""
+        """Note a failure; after the last attempt the work is given up."""
         before = self._failed.get(subject)
         fresh = before is None or now - before.at > self.law.memory
         self._note(subject, reason, now, 1 if fresh or before is None else before.count + 1)
@@ -139,7 +140,10 @@ class Attempts:
             self._tell(self.law.alarm.ended(subject))
 
     def renew(self, subjects: Iterable[str]) -> None:
-        """Start afresh: another attempt is wanted or more is known. An alarm stays until `done`."""
+        """Start afresh, because another attempt is wanted or more is known.
+
+        An alarm stays until `done` is called.
+        """
         for subject in subjects:
             self._failed.pop(subject, None)
 

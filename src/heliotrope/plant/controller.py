@@ -1,7 +1,7 @@
 """The plant controller: the central controller of a field of clusters.
 
 It knows the state of every heliostat and the age of that information, holds the single command
-authority, accepts operator commands, sends them to the clusters and follows them to completion,
+authority, accepts operator commands, sends them to the clusters and tracks them to completion,
 renews each cluster's lease every second, evaluates the safety table, and confirms that emergency
 orders are carried out.
 
@@ -108,11 +108,11 @@ class Stores:
     wanted
         Parameters that local controllers should store.
     assigned
-        Store of aims and standby points; None: they are lost when the program ends.
+        Store of aims and standby points; None: these points are lost when the program ends.
     record
-        Store of the active emergency; None: it is lost when the program ends.
+        Store of the active emergency; None: the emergency is lost when the program ends.
     disk
-        Runs work that waits for a disk; None: it is done in the event loop, as virtual time
+        Runs work that waits for a disk; None: the work is done in the event loop, as virtual time
         requires.
     """
 
@@ -139,7 +139,7 @@ class PlantController:
     settings
         Times and limits.
     table
-        Rows of the safety table; None: those of the design with the autonomy of the settings.
+        Rows of the safety table; None: the rows of the design, with the autonomy from the settings.
     entropy
         Source of random bytes for tokens and identities.
     on_alarm
@@ -161,8 +161,8 @@ class PlantController:
     aims, standbys
         Points to which the beams are sent, ENU, m, (N, 3); NaN if there is none.
     commands, guards, sentinel
-        What issues operator commands; what blocks them apart from the paths; and the safety table
-        with the active emergencies.
+        The part that issues operator commands; the guards that block commands, apart from the path
+        checks; and the sentinel, with the safety table and the active emergencies.
     movements, locks, stepping
         Aims that visits have moved, heliostats that they have locked, and fine steps that they
         need; the plant restores whatever a visit leaves behind.
@@ -255,7 +255,7 @@ class PlantController:
         )
 
     def _ordering(self, audit: Audit, disk: Disk) -> PlantOrders:
-        """Return the part that follows accepted commands to their ends."""
+        """Return the part that tracks accepted commands until they end."""
         return PlantOrders(
             self.clock,
             self.authority,
@@ -498,7 +498,7 @@ class PlantController:
                 part.on_second(now)
 
     def _writing(self) -> int:
-        """Return the token under which parameters may be written now, 0 if none may be written."""
+        """Return the token under which parameters may be written now; 0 if none may be written."""
         return 0 if self.sentinel.refusal(self.field.clusters) else self.authority.token
 
     def _tell(self, alarm: Alarm) -> None:
@@ -513,12 +513,12 @@ class PlantController:
         return self.clock.monotonic()
 
     def sun_vector(self, ahead: float = 0.0) -> FloatArray:
-        """Return the unit vector to the sun now, or a number of seconds ahead, ENU, (3,)."""
+        """Return the unit vector to the sun, ENU, (3,), now or some seconds from now."""
         return fast_vector(self.clock.utc().timestamp() + ahead, self.design.site)
 
     @property
     def standby_unknown(self) -> npt.NDArray[np.bool_]:
-        """A mask of the heliostats whose standby point is unknown, (N,); see `Points.unknown`."""
+        """Mask of the heliostats whose standby point is unknown, (N,); see `Points.unknown`."""
         return self._proofs.points.unknown("STANDBY")
 
     @property
@@ -534,7 +534,7 @@ class PlantController:
     def put(self, name: str, value: float, subject: str = "", *, made: float | None = None) -> None:
         """Accept a sensor reading for the safety table or for the proof of an emergency.
 
-        It was measured at ``made`` (monotonic s); None: now.
+        The reading was measured at ``made``, monotonic s; None: now.
 
         Raises
         ------
@@ -552,13 +552,13 @@ class PlantController:
     def stow(self, who: str, heliostats: Sequence[str] = ()) -> Ticket:
         """Send some or all heliostats to stow; anyone may order this.
 
-        If there are many, they go one after the other, see `PlantSettings.stow_rate`; an emergency
-        sends all at once.
+        If there are many, they go one after the other (see `PlantSettings.stow_rate`); in an
+        emergency all go at once.
         """
         return self._safe(who, Act.STOW, heliostats)
 
     def locked_for(self, heliostat: str) -> str:
-        """Return a text that explains a LOCKED state: reason, beginning and end."""
+        """Return a text that explains why a heliostat is LOCKED, since when and until when."""
         mandate = self.authority.visited().get(heliostat)
         visit = "" if mandate is None else f"the visit to {mandate.where} of {mandate.person.name}"
         held = self.guards.reasons(Asked("UNLOCK", (heliostat,)), NOT_NOW)
@@ -589,10 +589,10 @@ class PlantController:
         return ticket
 
     def raise_emergency(self, who: str, act: Act = Act.DEFOCUS, reason: str = "") -> EmergencyOrder:
-        """Order a field-wide DEFOCUS or STOW, with proof; anyone may order this.
+        """Order a field-wide DEFOCUS or STOW, whose execution is checked; anyone may order this.
 
-        Each operator's order holds until it is withdrawn, and the rows that it trips stay tripped
-        until they are acknowledged.
+        Each operator's order is in force until it is withdrawn, and the table rows that it trips
+        stay tripped until they are acknowledged.
 
         Raises
         ------
@@ -648,15 +648,15 @@ class PlantController:
         self.note(person, "AUTHORITY", "released")
 
     def withdraw_emergency(self, person: Person, owner: str = "") -> str:
-        """Withdraw the person's own emergency order, or, as an engineer, that of an ``owner``.
+        """Withdraw the person's own emergency order; an engineer may withdraw an ``owner``'s order.
 
-        The emergency continues while another person's order is active; the rows that it tripped
-        wait for `acknowledge`.
+        The emergency continues while another person's order is active. The table rows that the
+        order tripped wait for `acknowledge`.
 
         Returns
         -------
-        What the operator should know: how often the order was repeated, and when the next one is
-        accepted.
+        What the operator should know: how often the order was repeated, and when the person's next
+        order is accepted.
 
         Raises
         ------
@@ -713,7 +713,7 @@ class PlantController:
         self.note(person, "ACKNOWLEDGE", f"{condition} {subject}".strip())
 
     def note(self, person: Person, what: str, note: str) -> None:
-        """Record in the audit an action that moves nothing."""
+        """Record an action that moves nothing in the audit."""
         self._orders.note(person.name, person.role.title, what, note)
 
     # -- commands --------------------------------------------------------------------------
@@ -740,7 +740,7 @@ class PlantController:
         Raises
         ------
         RefusedError
-            If it is not accepted; in that case nothing is sent.
+            If the command is not accepted; in that case nothing is sent.
         InputError
             If a name is unknown, or values do not fit.
         """
@@ -751,7 +751,7 @@ class PlantController:
     def default_aims(
         self, heliostats: Sequence[str] = (), points: npt.ArrayLike | None = None
     ) -> dict[str, FloatArray]:
-        """Return an aim per heliostat (() for all), to pass to `aim`; see `aims.default_aims`."""
+        """Return one aim per heliostat (() for all), for `aim`; see `aims.default_aims`."""
         names = tuple(heliostats) or self.field.names
         rows = np.array([self.field.place(name) for name in names], dtype=np.intp)
         vertices = self.beams.armature.origin_1[rows]
@@ -772,7 +772,7 @@ class PlantController:
         Raises
         ------
         RefusedError
-            If it is not accepted, or one of the beams is not allowed there.
+            If the command is not accepted, or one of the beams is not allowed at its point.
         """
         return self.commands.point(person, token, "AIM", points)
 
@@ -789,7 +789,7 @@ class PlantController:
         confirmed: str = "",
         record: HeliostatCalibration | None = None,
     ) -> Ticket:
-        """Send journal items (see `board_items`) to one heliostat, and keep them as wanted.
+        """Send journal items (see `board_items`) to one heliostat; from now on they are wanted.
 
         Items that change the pose are accepted only where the beam is safe: at stow, or at rest
         where the beam and its path to standby are clear with both the present and the new
@@ -810,7 +810,7 @@ class PlantController:
         Raises
         ------
         RefusedError
-            If it is not accepted.
+            If the change is not accepted.
         InputError
             If a plant does not send such items.
         """
@@ -841,27 +841,26 @@ class PlantController:
         return ticket
 
     def _use(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
-        """Use an armature (18,) and drives (2, 19) in proofs, and in the pointing comparison."""
+        """Use an armature (18,) and drives (2, 19) in path checks and the pointing comparison."""
         self.beams.replace(row, armature, drives)
         self._agreement.believe(row, armature, drives)
         self._identities.learn(row, armature)
 
     @contextmanager
     def unverified(self, heliostat: str) -> Iterator[None]:
-        """Trust new parameters of a heliostat no more than the present ones, until verified.
+        """Check a heliostat's paths with both its new and its present parameters, until verified.
 
-        Until then the heliostat may not join the receiver, and its paths are proven with both sets
-        of parameters.
+        Until the new parameters are verified, the heliostat may not join the receiver.
         """
         with self.doubtful.unverified(heliostat), self._proofs.unverified(heliostat):
             yield
 
     def misled(self, heliostat: str, point: FloatArray) -> str | None:
-        """Return the reason if unverified parameters block a path to a point (3,)."""
+        """Return why unverified parameters block a path to a point (3,); None if they do not."""
         return self._proofs.misled(heliostat, point)
 
     def _unwritable(self, heliostat: str) -> str | None:
-        """Return the reason why nothing may be written to a heliostat, None if it may."""
+        """Return why nothing may be written to a heliostat; None if writing is allowed."""
         asked, kinds = Asked("PARAMETERS", (heliostat,)), (OUT_OF_SERVICE, BEAM_REFUSED)
         return self.guards.reasons(asked, *kinds).get(heliostat)
 
@@ -882,7 +881,8 @@ class PlantController:
     def want(self, heliostat: str, mechanism: Mechanism) -> None:
         """Use a mechanism, batch shape (), in the beam checks and as the wanted parameters.
 
-        The local controller is compared with it, and updated when its state allows.
+        The local controller's parameters are compared with this mechanism, and updated when the
+        state of the heliostat allows.
         """
         row = self.field.place(heliostat)
         self._use(row, mechanism.armature.table, mechanism.drives.table)
@@ -890,7 +890,10 @@ class PlantController:
         self._sync.compare(heliostat)
 
     async def ask_cluster(self, cluster: str, what: str, timeout: float) -> Answer | None:
-        """Return a cluster's reply to a query, or None; an unknown cluster is an error."""
+        """Return a cluster's reply to a query; None if there is no reply.
+
+        An unknown cluster is an error.
+        """
         if cluster not in self._clusters.ends:
             raise UnknownNameError("cluster", cluster, self._clusters.ends)
         return await self._clusters.answer(cluster, what, timeout)
@@ -913,12 +916,12 @@ class PlantController:
 
 
 def _expected(settings: PlantSettings) -> str:
-    """Return the checksum that clusters should report, empty if none is configured."""
+    """Return the checksum that clusters should report; "" if none is configured."""
     return "" if settings.common is None else settings_checksum(settings.common)
 
 
 def _checked(design: Plant, links: Mapping[str, Link]) -> Mapping[str, Sequence[str]]:
-    """Return the heliostats of each cluster, which must have a link each."""
+    """Return the heliostats of each cluster; check that each cluster has a link."""
     members = clusters_of(design)
     odd = sorted(set(members) ^ set(links))
     if odd:

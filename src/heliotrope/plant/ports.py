@@ -53,7 +53,7 @@ class Cameras(Protocol):
         ...
 
     async def look(self, target: str) -> object:
-        """Photograph the target before a beam arrives.
+        """Photograph the target, before a beam arrives there.
 
         Raises
         ------
@@ -72,7 +72,7 @@ class Cameras(Protocol):
         Raises
         ------
         FetchError, InputError
-            If there is no photograph or, because its light is awaited, no usable one.
+            If there is no photograph or, if the evaluation is awaited, no usable photograph.
         """
         ...
 
@@ -81,12 +81,12 @@ class Cameras(Protocol):
         ...
 
     def eye(self, target: str) -> Camera:
-        """Return the camera of the target, as it is currently known.
+        """Return the camera of the target as it is now known.
 
         Raises
         ------
         UnknownNameError
-            If no camera observes it.
+            If no camera observes the target.
         """
         ...
 
@@ -96,12 +96,12 @@ class Cameras(Protocol):
         Raises
         ------
         FetchError, InputError
-            If there is none.
+            If there is no frame.
         """
         ...
 
     def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
-        """Evaluate later photographs with a camera, a target and its marks, and taught pictures."""
+        """Set the camera, target marks and reference pictures for evaluating later photographs."""
         ...
 
 
@@ -118,35 +118,37 @@ class Ports:
     audit
         Records of commands, written before the commands are sent.
     cameras
-        None: nothing is calibrated.
+        Cameras of the targets; None: nothing is calibrated.
     sensors
-        None: no reading comes from outside.
+        Sensors; None: no reading comes from outside.
     witnesses
         Independent witnesses of the sun, beside photographs.
     disk
-        Does the work of audit and assigned points; it is closed with the plant. None: they are
-        written in the loop, as virtual time needs it.
+        Does the disk work of the audit and the assigned points, and is closed with the plant. None:
+        the work is done in the event loop, as virtual time requires.
     pictures
-        Keeps photographs of calibrations; it is closed with the plant. None: they are not kept.
+        Stores photographs of calibrations, and is closed with the plant. None: photographs are not
+        stored.
     marks
-        Plant file that keeps the views of targets that persons mark; None: they end with the
-        program.
+        Plant file that stores the target views that operators mark; None: these views are lost when
+        the program ends.
     records
-        Store of sightings, events and holds; None: they end with the program.
+        Store of sightings, events and locks; None: these are lost when the program ends.
     assigned
-        Store of assigned aims and standby points; None: they end with the program.
+        Store of assigned aims and standby points; None: these points are lost when the program
+        ends.
     beside
-        Makes the programs that begin before the plant and run beside it: links, clusters of this
-        machine, a simulated field.
+        Creates the tasks that begin before the plant and run beside it: links, clusters on this
+        computer, a simulated field.
     ready
-        Waits until operations may begin: a simulated field is led by then.
+        Waits until operations may begin; by then the plant controls a simulated field.
     truth
         Returns the true tracking error of each heliostat, rad, (N,), in the order of the plant's
         field; None where it is unknown, as in every real plant.
     learner
-        Learns groups of mirrors at night; None: nothing is learnt, as in virtual time.
+        Learns heliostat groups at night; None: nothing is learnt, as in virtual time.
     worker
-        Computes what takes long, beside the plant's loop; in virtual time in it.
+        Runs long computations outside the plant's event loop; in virtual time, inside it.
     facts
         Returns further rows of the summary, by name.
     """

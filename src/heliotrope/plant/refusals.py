@@ -1,4 +1,4 @@
-"""Every kind of refusal by the plant, as data: when, text and remedy.
+"""All kinds of refusal by the plant, as data: circumstances, text and remedy.
 
 `docs/reference/alarms.md` lists them. The code that refuses fills in the text:
 ``ROLE_TOO_LOW.error(what="TRACK", ...)``.
@@ -23,23 +23,23 @@ class RefusedError(HeliotropeError):
 
 
 class NoFreePath(str):
-    """The reason why the path of a beam is not clear; it changes with the sun, aim or volumes.
+    """The reason why the path of a beam is not clear; it depends on sun, aim and volumes.
 
-    Other reasons end by themselves, or have alarms of their own.
+    Reasons of other kinds end by themselves, or have alarms of their own.
     """
 
     __slots__ = ()
 
 
 def by_reason(reasons: Mapping[str, str], most: int = 3) -> str:
-    """Return the reasons of heliostats in one line, each once, with the number of heliostats.
+    """Return the heliostats' reasons in one line, each once with its number of heliostats.
 
     Parameters
     ----------
     reasons
         Reasons by heliostat.
     most
-        Number of reasons written out, starting with the reasons of most heliostats.
+        Number of reasons written out, starting with the most frequent.
     """
     groups: dict[str, list[str]] = {}
     for name, text in reasons.items():
@@ -68,7 +68,7 @@ class Refusal:
     text
         Display text, with fields to fill in.
     remedy
-        What to do: one sentence.
+        What to do, in one sentence.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Settings of a plant: its times and limits, and the heliostats of each cluster."""
+"""Settings of a plant: times and limits, and the heliostats of each cluster."""
 
 import math
 from collections import deque
@@ -22,7 +22,8 @@ class PlantSettings:
     period, beat
         Interval between leases; interval between evaluations of the safety table and the queues, s.
     join_rate, join_burst
-        Number of heliostats that may join the receiver per second, and at once after a pause.
+        Number of heliostats that may join the receiver per second, and number that may join at once
+        after a pause.
     join_wait
         Maximum time that a heliostat may wait to join, s.
     join_life
@@ -46,13 +47,13 @@ class PlantSettings:
         Maximum change of a heliostat's beam by new parameters that nobody has confirmed, rad.
     stow_rate
         Number of heliostats per second that start an ordinary STOW of more than this number, so
-        that their drives do not start together; 0: all at once. With the default, 10,000 take 50 s,
-        and 2 % of the field start per second. An operator's LOCK removes a waiting heliostat from
-        its order. Emergencies and the safety table never wait.
+        that their drives do not start together; 0: all start at once. With the default, 10,000
+        heliostats take 50 s, and 2 % of the field start per second. An operator's LOCK removes a
+        waiting heliostat from its order. Emergencies and the safety table never wait.
     witnesses
         Witnesses of the sun, one of which must agree before the first heliostat of a day joins a
-        receiver. Empty: the plant reports once a day that there is none; None: this is accepted.
-        See `witnesses`.
+        receiver. Empty: the plant reports once a day that there is no witness; None: this is
+        accepted without a report. See `witnesses`.
     firmware
         Firmware version that every board should have; None: versions are not compared.
     common
@@ -100,7 +101,7 @@ class PlantSettings:
 
 @dataclass
 class Counters:
-    """Counts since start-up: refused messages, statuses, leases sent; and the last problems."""
+    """Counts of refused messages, statuses and sent leases since start-up; the last problems."""
 
     refused: int = 0
     statuses: int = 0

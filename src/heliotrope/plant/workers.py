@@ -33,8 +33,8 @@ class Worker(Protocol):
         Parameters
         ----------
         work, given
-            A function of a module, and its arguments, which are pickled and must contain all that
-            it needs. It changes nothing that others use.
+            A module-level function, and its arguments, which are pickled and must contain
+            everything that the function needs. The function must not change any shared state.
 
         Raises
         ------
@@ -50,7 +50,7 @@ async def at_once(work: Callable[[*Given], T], *given: *Given) -> T:
 
 
 class WorkerProcesses:
-    """Processes that compute for a plant; if one dies, new ones begin.
+    """Processes that compute for a plant; if a process dies, new processes are started.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class WorkerProcesses:
         self._pool = pool(count, _NICE)
 
     def start(self, *loads: Callable[[], None]) -> None:
-        """Start the processes, which share compiled code: what one compiles, all load."""
+        """Start the processes, which share compiled code: each function is compiled once."""
         for load in loads:
             self._pool.submit(load)
 

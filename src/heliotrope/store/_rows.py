@@ -1,4 +1,4 @@
-"""Conversion of records to table rows, and back.
+"""Converts records to table rows, and back.
 
 Fields and columns are matched by name, and the column types convert the values (see `tables`). Two
 kinds of record have their own functions because one record spans many rows: sightings, and the
@@ -30,7 +30,7 @@ Record = TypeVar("Record")
 
 
 def insert(connection: Connection, table: Table, rows: Sequence[Row]) -> int:
-    """Insert rows, except those whose key exists already; return the number of inserted rows."""
+    """Insert rows, except rows whose key exists already; return the number of inserted rows."""
     if not rows:
         return 0
     return connection.execute(_insert(connection.dialect.name, table), list(rows)).rowcount
@@ -38,14 +38,14 @@ def insert(connection: Connection, table: Table, rows: Sequence[Row]) -> int:
 
 @cache
 def _insert(dialect: str, table: Table) -> Executable:
-    """Return the insert statement, cached because events arrive in thousands."""
+    """Return the insert statement, which is cached because events arrive in thousands."""
     kind = postgresql if dialect == "postgresql" else sqlite
     statement: Executable = kind.insert(table).on_conflict_do_nothing()
     return statement
 
 
 def replace(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
-    """Insert rows; each replaces an existing row with its key."""
+    """Insert rows; each row replaces an existing row with the same key."""
     if not rows:
         return
     kind = postgresql if connection.dialect.name == "postgresql" else sqlite
@@ -56,13 +56,19 @@ def replace(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
 
 
 def row_of(table: Table, record: object, **others: Any) -> Row:
-    """Return the row of a record: each column from the attribute of its name or ``others``."""
+    """Return the row of a record.
+
+    Each column is taken from the attribute of the same name, or from ``others``.
+    """
     own = (key for key in table.columns.keys() if key not in others)  # noqa: SIM118
     return {**{key: getattr(record, key) for key in own}, **others}
 
 
 def record_of(kind: type[Record], row: RowMapping, **others: Any) -> Record:
-    """Return the record of a row: each field from the column of its name or from ``others``."""
+    """Return the record in a row.
+
+    Each field is taken from the column of the same name, or from ``others``.
+    """
     names = {field.name for field in fields(cast("Any", kind))} - others.keys()
     return kind(**{name: row[name] for name in names if name in row}, **others)
 
@@ -141,7 +147,7 @@ def kept_sightings(rows: Sequence[SqlRow[Any]]) -> KeptSightings:
 def behind_rows(
     record: HeliostatCalibration, standing: Mapping[int, bool]
 ) -> tuple[list[Row], list[int]]:
-    """Return the changes of a version to the table ``parameter_sighting``.
+    """Return the changes that a version makes to the table ``parameter_sighting``.
 
     Parameters
     ----------
@@ -152,7 +158,7 @@ def behind_rows(
 
     Returns
     -------
-        The new rows, and the sighting numbers whose rows end.
+        The new rows, and the numbers of the sightings whose rows end with this version.
     """
     nothing = np.full((len(record.left_out), 4), np.nan)
     misses = np.concatenate([record.residual_before, record.residual_after], axis=1)
@@ -179,7 +185,7 @@ class Behind:
     Parameters
     ----------
     found
-        Its rows of the table ``parameter_sighting``, in the order of the numbers.
+        The heliostat's rows of the table ``parameter_sighting``, in the order of the numbers.
     """
 
     def __init__(self, rows: Sequence[RowMapping]) -> None:
@@ -194,7 +200,10 @@ class Behind:
         self._misses = np.array([[row[name] for name in _MISSES] for row in rows]).reshape(-1, 4)
 
     def of(self, version: int) -> dict[str, Any]:
-        """Return the fields of a version; residuals of sightings new in it, else NaN."""
+        """Return the fields of a version.
+
+        Residuals are NaN except for sightings that are new in this version.
+        """
         stands = (self._from <= version) & (version < self._until)
         used = np.flatnonzero(stands & self._used)
         new = (self._from[used] == version)[:, None]

@@ -20,7 +20,7 @@ def begin(connection: Connection, entry: AuditEntry) -> None:
     Raises
     ------
     InputError
-        If another record has its identity.
+        If another record has the same identity.
     """
     known = _find(connection, entry.identity)
     if known is not None:
@@ -54,7 +54,7 @@ def finish(connection: Connection, identity: str, result: str, at: str) -> None:
 
 
 def finish_open(connection: Connection, result: str, at: str) -> int:
-    """Add one result to all records without one; return their number."""
+    """Add the same result to all records that have none; return the number of these records."""
     query = select(_AUDIT.c.identity).where(_AUDIT.c.result == "").order_by(_AUDIT.c.number)
     identities = connection.scalars(query).all()
     for identity in identities:
@@ -63,7 +63,7 @@ def finish_open(connection: Connection, result: str, at: str) -> int:
 
 
 def entries(connection: Connection, limit: int = 100, before: int = 0) -> list[AuditEntry]:
-    """Return records, latest first; only those before a given number, if any."""
+    """Return records, latest first; if a number is specified, only earlier records."""
     query = select(_AUDIT).order_by(_AUDIT.c.number.desc()).limit(limit)
     if before:
         query = query.where(_AUDIT.c.number < before)
@@ -77,7 +77,7 @@ def _find(connection: Connection, identity: str) -> AuditEntry | None:
 
 
 def probe(connection: Connection) -> None:
-    """Write a meaningless row, because only a write shows that the disk accepts one."""
+    """Write a meaningless row, because only a write shows whether the disk accepts writes."""
     about = tables.about
     known = connection.scalar(select(about.c.value).where(about.c.name == "probe"))
     row = {"name": "probe", "value": str(int(known or 0) + 1)}
@@ -99,7 +99,8 @@ def points(connection: Connection) -> dict[str, dict[str, tuple[float, ...]]]:
 def doubt_points(connection: Connection) -> None:
     """Mark all assigned points as not acknowledged by their local controllers.
 
-    An earlier point equal to the assigned one expresses this; see `plant.field.assigned`.
+    This is expressed by an earlier point that is equal to the assigned point; see
+    `plant.field.assigned`.
     """
     known = points(connection)
     doubted = {

@@ -6,12 +6,12 @@ every file; ``manifest.sig`` is the signature of the manifest, if a key was spec
 written completely or not at all. A restore needs an empty destination and never overwrites
 anything.
 
-The store in a backup is marked as such, however it reaches a plant: it holds a lock on the tower,
-and none of its assigned points counts as confirmed. Locks and assignments made after the backup are
-missing from it, so an operator confirms both before a heliostat leaves stow. Nobody can sign in
-with it either: it contains no session and no token, and the second-factor codes shown up to that
-time are marked as used. A restore repeats this for the time of the restore, and is recorded in the
-store.
+The store in a backup is marked as a backup, however it reaches a plant: it contains a lock on the
+tower, and none of its assigned points counts as confirmed. Locks and assignments made after the
+backup are missing from it, so an operator confirms both before a heliostat leaves stow. Nobody can
+sign in with the backup either: it contains no session and no token, and the second-factor codes
+shown up to that time are marked as used. A restore repeats this for the time of the restore, and is
+recorded in the store.
 """
 
 import hashlib
@@ -71,7 +71,7 @@ def backup(
     Parameters
     ----------
     database
-        Source; it may be written to in the meantime.
+        Database to back up; it may be written to in the meantime.
     folder
         Folder to create; it must not exist.
     now
@@ -79,7 +79,7 @@ def backup(
     telemetry
         Folder of the archive to include.
     key
-        Key that signs it; None: it is not signed.
+        Key that signs the backup; None: the backup is not signed.
 
     Raises
     ------
@@ -130,19 +130,20 @@ def backup(
 
 
 def check(folder: str | Path, *, signed_by: PublicKey | None = None) -> Backup:
-    """Return a backup after comparing every file with its checksum, and with a signature.
+    """Return a backup after checking every file's checksum, and the signature.
 
     Parameters
     ----------
     folder
         Folder of the backup.
     signed_by
-        The key that must have signed it; None: it may be unsigned.
+        The key that must have signed the backup; None: the backup may be unsigned.
 
     Raises
     ------
     FormatError
-        If it is not a backup, it is not signed by that key, or a file is missing, altered or added.
+        If the folder is not a backup, the backup is not signed by that key, or a file is missing,
+        altered or added.
     """
     place = Path(folder)
     path = place / MANIFEST
@@ -214,19 +215,19 @@ def restore(
     now
         Time of the restore.
     telemetry
-        Destination of its telemetry, if it has any; None: left out.
+        Destination of the backup's telemetry, if there is any; None: the telemetry is not restored.
     signed_by
         As in `check`.
     who
-        Person who restores it, for the event.
+        Person who restores the backup, for the event.
 
     Raises
     ------
     FormatError
         If the backup is damaged, or not signed by that key.
     StoreError
-        If there is a store already, another process holds it, it cannot be written, or the backup
-        is of a later program.
+        If there is already a store, another process has it open, it cannot be written, or the
+        backup was made by a later program.
     """
     restored = check(folder, signed_by=signed_by)
     if restored.revision > HEAD:
@@ -319,7 +320,7 @@ def summary(database: Database) -> dict[str, Any]:
 
 
 def migrate(place: str | Path) -> tuple[str, Path | None]:
-    """Bring a store up to date; return its old revision, and the copy made of it.
+    """Bring a store up to date; return its old revision, and the copy made beforehand.
 
     A file is first copied to ``store.before-REVISION.sqlite`` beside it; PostgreSQL changes its
     tables in one transaction.
@@ -327,7 +328,7 @@ def migrate(place: str | Path) -> tuple[str, Path | None]:
     Raises
     ------
     StoreError
-        If there is no store, another process holds it, it is newer than the program, or the
+        If there is no store, another process has it open, it is newer than the program, or the
         migration fails.
     """
     with Database(place) as database:
@@ -369,7 +370,7 @@ def _sync(path: Path) -> None:
 
 
 def _copy_file(source: Path, target: Path) -> None:
-    """Copy an SQLite database in one step, which gives a consistent state even during writes."""
+    """Copy an SQLite database in one step, so that the copy is consistent even during writes."""
     with (
         closing(sqlite3.connect(f"file:{source}?mode=ro", uri=True, timeout=10.0)) as old,
         closing(sqlite3.connect(target)) as new,
@@ -385,7 +386,7 @@ def _copy_file(source: Path, target: Path) -> None:
 
 @contextmanager
 def _changing(copy: Database) -> Iterator[Connection]:
-    """Yield a connection to change a copy in one transaction."""
+    """Yield a connection with which to change a copy in one transaction."""
     try:
         with copy.connect() as connection, connection.begin():
             yield connection
@@ -394,7 +395,7 @@ def _changing(copy: Database) -> Iterator[Connection]:
 
 
 def _end_access(connection: Connection, now: datetime) -> None:
-    """End all sessions and tokens, and use up the second-factor codes shown until a given time."""
+    """End all sessions and tokens; mark second-factor codes shown until a given time as used."""
     factor, last = tables.second_factor, int(now.timestamp() // STEP) + NEAR
     with chain.changing_accounts(connection, None):
         for table in (tables.session, tables.api_token):
@@ -451,7 +452,7 @@ def _parts(connection: Connection, table: Any) -> Iterator[list[dict[str, Any]]]
 
 
 def _copy_telemetry(source: Path, target: Path) -> None:
-    """Copy an archive whose parts may become Parquet files in the meantime."""
+    """Copy an archive, whose parts may become Parquet files in the meantime."""
     target.mkdir(mode=0o700)
     for _ in range(2):
         for path in sorted(source.glob("????-??-??/*.*")):

@@ -2,15 +2,14 @@
 
 Each link contains the SHA-256 of a record's content and of the previous digest. An event has one
 link; an audit record has two, one at acceptance and one with its result; an account or token has
-one per change, with its state before and after. The single writer creates the links in the
+one link per change, with its state before and after. The single writer creates the links in the
 transaction of the record, so they cost no further sync, and a plant that is killed leaves
 consistent chains.
 
 Anyone who can write to the database can recompute all digests, or remove the newest records. The
 heads (`heads`) are therefore stored on another computer, and `verify` compares them. Old events are
-removed; what remains of them is the anchor, the number and digest of the last event removed. A
-stored head of that event is compared with the anchor; a head of an older event can no longer be
-compared.
+removed. What remains is the anchor: the number and the digest of the last event removed. A stored
+head of that event is compared with the anchor; a head of an older event can no longer be compared.
 """
 
 import hashlib
@@ -86,7 +85,7 @@ def _add_link(connection: Connection, identity: str, part: str, content: list[An
 
 @contextmanager
 def changing_accounts(connection: Connection, names: Iterable[str] | None) -> Iterator[None]:
-    """Link what a block changes in the accounts and tokens of some persons (None: all)."""
+    """Add links for the changes that a block makes to persons' accounts and tokens (None: all)."""
     chosen = None if names is None else sorted(set(names))
     before = _states(connection, chosen)
     yield
@@ -141,7 +140,7 @@ def _append(
 
 
 def _last(connection: Connection, chain: str) -> tuple[int, str]:
-    """Return number and digest of the last link, as the writing connection remembers it."""
+    """Return the number and the digest of the last link, as the writing connection knows them."""
     if chain not in connection.info:
         connection.info[chain] = _read_last(connection, chain)
     number, digest = connection.info[chain]
@@ -164,7 +163,7 @@ def _about(connection: Connection, name: str) -> str | None:
 
 
 def _anchor_number(connection: Connection) -> int:
-    """Return the number of the last event removed, 0 if there is none."""
+    """Return the number of the last event removed; 0 if none was removed."""
     noted = _about(connection, ANCHOR_NUMBER)
     if noted is not None:
         return int(noted)
@@ -175,7 +174,7 @@ def _anchor_number(connection: Connection) -> int:
 
 
 def forget_events(connection: Connection, before: float) -> None:
-    """Remove the oldest events, up to the first that is not before a given time."""
+    """Remove the oldest events, up to the first event that is not before a given time."""
     e = _EVENT.c
     kept = connection.scalar(select(func.min(e.number)).where(e.at >= before))
     last = connection.scalar(select(func.max(e.number)))
@@ -200,7 +199,7 @@ HEADS = "heads"
 
 
 def write_heads(folder: Path, new: Iterable[Head], at: datetime) -> None:
-    """Append heads to the file `HEADS` in a folder; they are on disk when this returns.
+    """Append heads to the file `HEADS` in a folder; the heads are on disk when this returns.
 
     Raises
     ------
@@ -221,12 +220,14 @@ def write_heads(folder: Path, new: Iterable[Head], at: datetime) -> None:
 
 
 def read_heads(path: Path) -> list[Head]:
-    """Return the heads in a file: lines of `write_heads`, or text that contains heads anywhere.
+    """Return the heads in a file.
+
+    The file has the lines of `write_heads`, or is any text that contains heads.
 
     Raises
     ------
     InputError
-        If it contains none, or cannot be read.
+        If the file contains no heads, or cannot be read.
     """
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
@@ -260,7 +261,7 @@ class Verified:
     fitting
         Earlier heads that are in the chains, or match the anchor.
     old
-        Heads of events before the anchor, and of chains that were empty; they prove nothing.
+        Heads of events before the anchor, and of chains that were empty; these cannot be checked.
     since
         Time of the oldest stored event, POSIX s; None if there is none.
     """
@@ -277,8 +278,8 @@ def verify(connection: Connection, known: Iterable[Head] = ()) -> Verified:
     Raises
     ------
     StoreError
-        If a record does not fit (the text names the first), or if heads are given but none of them
-        can be compared.
+        If a record does not fit the chain (the text names the first such record), or if heads are
+        specified but none of them can be compared.
     """
     _verify_events(connection)
     _verify_audit(connection)
@@ -368,7 +369,7 @@ def _verify_accounts(connection: Connection) -> None:
 
 
 def _compare(key: Key, linked: str, found: str, when: str) -> None:
-    """Check that an account or token matches its last link; "": it did not exist."""
+    """Check that an account or token matches its last link; a state of "": it did not exist."""
     if linked != found:
         what = "altered" if linked and found else "removed" if linked else "added"
         raise StoreError(
@@ -389,7 +390,7 @@ def _named(key: Key, state: str) -> str:
 
 
 def _verify_head(connection: Connection, head: Head) -> bool:
-    """Check a head; return whether anything remains to compare it with."""
+    """Check a head; return whether there is still a record to compare it with."""
     if head.number == 0:
         return False
     table = _LINKS[head.chain]

@@ -45,7 +45,7 @@ class Database:
     url
         URL of the database.
     file
-        File of SQLite, None for PostgreSQL.
+        File of the SQLite database; None for PostgreSQL.
 
     Raises
     ------
@@ -100,7 +100,9 @@ class Database:
             raise StoreError(f"store {self.name}: cannot be read ({cause(error)})") from None
 
     def connect(self) -> Connection:
-        """Return a connection for writing; on PostgreSQL it holds the lock if the store does.
+        """Return a connection for writing.
+
+        On PostgreSQL, the connection acquires the lock if this object holds the lock.
 
         Raises
         ------
@@ -121,7 +123,7 @@ class Database:
         Raises
         ------
         StoreError
-            If another process is, or the folder cannot be written to.
+            If another process is already writing, or the folder cannot be written to.
         """
         if self.file is None:
             self.locked = True
@@ -168,7 +170,7 @@ class Database:
             ) from None
 
     def revision(self) -> str:
-        """Return the revision of the tables; empty if there are no tables.
+        """Return the revision of the tables; "" if there are no tables.
 
         Raises
         ------
@@ -183,12 +185,12 @@ class Database:
             return str(connection.scalar(text("SELECT version_num FROM alembic_version")) or "")
 
     def require(self) -> None:
-        """Check that the tables exist and have this program's revision.
+        """Check that the tables exist and have the revision of this program.
 
         Raises
         ------
         StoreError
-            If they do not.
+            If the tables do not exist, or have a different revision.
         """
         revision = self.revision()
         if not revision:
@@ -203,19 +205,19 @@ class Database:
             )
 
     def prepare(self) -> None:
-        """Create the tables of a new store; refuse a store of another revision.
+        """Create the tables of a new store; refuse a store with a different revision.
 
         Raises
         ------
         StoreError
-            If it has another revision, or cannot be created.
+            If the store has a different revision, or cannot be created.
         """
         if not self.revision():
             self.migrate()
         self.require()
 
     def migrate(self) -> None:
-        """Bring the tables up to date, all or nothing.
+        """Bring the tables up to date, completely or not at all.
 
         Raises
         ------
@@ -331,14 +333,14 @@ def make_private(folder: Path) -> None:
     folder.mkdir(exist_ok=True)
 
 
-#: What a plant creates in its data folder, beside the store.
+#: Files and folders that a plant creates in its data folder, beside the store.
 MADE = ("telemetry", "targets", "marks", "photographs", "interface", "first-password")
 
 
 def tighten(folder: Path) -> None:
     """Revoke other users' access to a data folder of an earlier program, and to its content.
 
-    Files that a plant did not create are left alone, and so is a folder that is shared by design.
+    Files that a plant did not create are not changed, nor is a folder that is shared by design.
     """
     status = folder.stat()
     if status.st_mode & stat.S_ISVTX or status.st_uid != os.geteuid():

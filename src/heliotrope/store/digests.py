@@ -15,7 +15,7 @@ EVENT, AUDIT, ACCOUNT = CHAINS = "event", "audit", "account"
 
 @dataclass(frozen=True)
 class Head:
-    """Number and digest of the last link of a chain, one of `CHAINS`."""
+    """Number and digest of the last link of a chain; the chain is one of `CHAINS`."""
 
     chain: str
     number: int
@@ -26,7 +26,7 @@ class Head:
 
     @classmethod
     def read(cls, text: str) -> "Head":
-        """Return a head from its text.
+        """Return the head that a text represents.
 
         Raises
         ------

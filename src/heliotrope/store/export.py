@@ -1,9 +1,9 @@
-"""Every calibration step as CSV: sightings, their beam errors, and the learnt parameters.
+"""Exports every calibration step as CSV: sightings, their beam errors, and learnt parameters.
 
-One folder per heliostat, like the records that Malan used for troubleshooting: ``sightings.csv``
-(which `calibration.sighting_table` reads), ``residuals.csv`` (for the new sightings of each
-version, before and after), ``versions.csv``, ``parameters.csv`` and ``covariance.csv``; and
-``heliostats.csv`` beside the folders.
+There is one folder per heliostat, like the records that Malan used for troubleshooting. It contains
+``sightings.csv`` (which `calibration.sighting_table` reads), ``residuals.csv`` (for the new
+sightings of each version, before and after the fit), ``versions.csv``, ``parameters.csv`` and
+``covariance.csv``. The file ``heliostats.csv`` lies beside the folders.
 """
 
 import csv
@@ -39,7 +39,8 @@ def export(
     Parameters
     ----------
     database
-        Source; it may be written to in the meantime, because the export shows one consistent state.
+        Database to export; it may be written to in the meantime, because the export reads one
+        consistent state.
     folder
         Destination, created if missing; existing files are replaced.
     heliostats
@@ -77,7 +78,7 @@ def export(
 
 
 def folder_name(heliostat: str) -> str:
-    """Return the name of a heliostat's folder; characters that file systems refuse are %-coded."""
+    """Return the name of a heliostat's folder; characters that file systems refuse are encoded."""
     name = quote(heliostat, safe=" +-_.,()=@")
     return name.replace(".", "%2E") if set(name) <= {"."} else name
 
@@ -119,7 +120,7 @@ def _write(path: Path, header: Sequence[str], lines: Iterable[Sequence[Any]]) ->
 
 
 def _cell(value: Any) -> str:
-    """Return a cell: empty for NaN; a float reads back as the same float."""
+    """Return the text of a CSV cell: "" for NaN; a float reads back as the same float."""
     if isinstance(value, float):
         return "" if np.isnan(value) else repr(float(value))
     return str(value)

@@ -37,7 +37,7 @@ _BYTES = 32
 
 @dataclass(frozen=True)
 class Used:
-    """A correct code: whether it was a recovery code, and how many of those remain."""
+    """A correct code: whether it was a recovery code, and how many recovery codes remain."""
 
     recovery: bool
     left: int
@@ -66,14 +66,16 @@ class Factors:
         self._database, self._writer, self._file, self._entropy = database, writer, file, entropy
 
     def begin(self, name: str, now: float) -> str:
-        """Return a new secret of an account, base32; in force once `confirm` accepts its code.
+        """Return a new secret for an account, base32.
+
+        The secret is in force once `confirm` accepts a code made from it.
 
         Raises
         ------
         InputError
-            If the account has a second factor already, or the key file cannot be used.
+            If the account already has a second factor, or the key file cannot be used.
         StoreError
-            If it could not be written.
+            If the secret could not be written.
         """
         word = self._entropy(16).hex()
         made = self._secret(name, word)
@@ -92,7 +94,7 @@ class Factors:
         return made
 
     def confirm(self, name: str, code: str, now: float) -> tuple[str, ...]:
-        """Activate the secret from `begin`; return the recovery codes, which are shown only now.
+        """Activate the secret from `begin`; return the recovery codes, which are shown only once.
 
         Raises
         ------
@@ -122,12 +124,14 @@ class Factors:
         return codes
 
     def check(self, name: str, code: str, now: float) -> Used | None:
-        """Use a code; None if it is wrong. Each code is valid once.
+        """Use a code; return None if it is wrong.
+
+        Each code is valid only once.
 
         Raises
         ------
         StoreError
-            If its use could not be written.
+            If the use of the code could not be written.
         """
 
         def work(connection: Connection) -> Used | None:
@@ -158,7 +162,7 @@ class Factors:
         return self._change(name, work)
 
     def _change(self, name: str, work: Work[T]) -> T:
-        """Change the second factor of an account; the change is linked, see `chain`."""
+        """Change the second factor of an account; the change is linked into the chain."""
 
         def linked(connection: Connection) -> T:
             with chain.changing_accounts(connection, (name,)):

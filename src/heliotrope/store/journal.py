@@ -31,7 +31,7 @@ def search(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
 
 
 def _within(column: ColumnElement[Any], query: JournalQuery, *, text: bool = False) -> Any:
-    """Return the condition for a time range, in POSIX s or (``text``) in ISO 8601."""
+    """Return the SQL condition for a time range, in POSIX s or, with ``text``, in ISO 8601."""
     since, until = (
         datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds") if text else at
         for at in (query.since, query.until)
@@ -40,7 +40,7 @@ def _within(column: ColumnElement[Any], query: JournalQuery, *, text: bool = Fal
 
 
 def _has(text: str, *columns: ColumnElement[Any]) -> list[Any]:
-    """Return the condition that one of some columns contains a text, ignoring case."""
+    """Return the SQL condition that any of some columns contains a text, ignoring case."""
     return [or_(*(column.icontains(text, autoescape=True) for column in columns))] if text else []
 
 

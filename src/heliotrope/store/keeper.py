@@ -114,12 +114,12 @@ class Keeper:
 
     @property
     def problem(self) -> str:
-        """Why records cannot be written now; empty while they can."""
+        """Why records cannot be written now; "" if they can."""
         return self.writer.problem or self.writer.crowded
 
     @property
     def refused(self) -> str:
-        """The last record that the database rejected because of its content; empty if none."""
+        """The last record that the database rejected because of its content; "" if none was."""
         return self.writer.refused
 
     @property
@@ -133,7 +133,7 @@ class Keeper:
         Raises
         ------
         StoreError
-            If something could not be written.
+            If a record could not be written.
         """
         self._readers.shutdown(wait=False, cancel_futures=True)
         try:
@@ -202,12 +202,13 @@ class Keeper:
         return numbers
 
     def record_calibration(self, *records: HeliostatCalibration) -> None:
-        """Record calibrations; each version must be above the recorded ones of its heliostat.
+        """Record calibrations; a version must exceed all recorded versions of its heliostat.
 
         Raises
         ------
         InputError
-            If a version is not above them, or a heliostat occurs twice; then none is recorded.
+            If a version does not exceed the recorded versions, or a heliostat occurs twice; in that
+            case no calibration is recorded.
         StoreError
             If too many records are already waiting.
         """
@@ -243,7 +244,7 @@ class Keeper:
         until: float = float("inf"),
         campaign: str = "",
     ) -> KeptSightings:
-        """Return sightings by time, for some heliostats (None: all) and one campaign if given."""
+        """Return sightings by time, for some heliostats (None: all) and optionally one campaign."""
         s = tables.sighting.c
         query = select(tables.sighting).order_by(s.time, s.number)
         if heliostats is not None and len(heliostats) <= _MANY:
@@ -320,7 +321,7 @@ class Keeper:
             return [Outlook.of(*row) for row in connection.execute(query)]
 
     def figures(self, since: float, until: float) -> list[PlantFigures]:
-        """Return the plant's time series from a start time to before an end time, oldest first."""
+        """Return the plant's time series between two times, oldest first; the end is excluded."""
         f = tables.figures.c
         query = select(tables.figures).where(f.at >= since, f.at < until).order_by(f.at)
         return self._records(PlantFigures, query)
@@ -394,7 +395,10 @@ class Keeper:
         severity: Severity = Severity.INFO,
         before: int = 0,
     ) -> list[Event]:
-        """Return events of at least a given severity, latest first; before a number if given."""
+        """Return events of at least a given severity, latest first.
+
+        If a number is specified, only events with lower numbers are returned.
+        """
         _check_severity(severity)
         e = tables.event.c
         query = select(tables.event).where(e.severity >= severity)
@@ -443,7 +447,7 @@ class Keeper:
     # -- holds ---------------------------------------------------------------------------
 
     def hold(self, holds: Sequence[Lockout]) -> None:
-        """Store locks; a new lock replaces the same person's earlier lock."""
+        """Store locks; a new lock replaces the same person's earlier lock on the same object."""
         new = {_locked(hold): hold for hold in holds}
         first = self._take_numbers(tables.hold, len(new))
         made = [
@@ -478,7 +482,7 @@ class Keeper:
         return tuple(self._holds.values())
 
     def exchange_limits(self, numbers: Mapping[str, float]) -> dict[str, float]:
-        """Store the safety-table limits in force; return those of the previous run, or {}."""
+        """Store the safety-table limits in force; return the limits of the previous run, or {}."""
         about = tables.about
 
         def work(connection: Connection) -> str | None:
@@ -491,27 +495,27 @@ class Keeper:
         return {} if before is None else dict(json.loads(before))
 
     def emergency(self) -> str:
-        """Return the document about the emergency in force; empty if there is none."""
+        """Return the document about the active emergency; an empty document if there is none."""
         return self._document(_EMERGENCY)
 
     def keep_emergency(self, document: str) -> None:
-        """Replace the document about the emergency in force; empty: the emergency has ended."""
+        """Replace the document about the active emergency; an empty one means that it has ended."""
         self._keep_document(_EMERGENCY, document)
 
     def waiting_changes(self) -> str:
-        """Return the document about changes that await approval; empty if there are none."""
+        """Return the document about changes that await approval; an empty document if none do."""
         return self._document(_CHANGES)
 
     def keep_waiting_changes(self, document: str) -> None:
-        """Replace the document about changes that await approval; empty: there are none."""
+        """Replace the document about changes that await approval; an empty one means none do."""
         self._keep_document(_CHANGES, document)
 
     def aimed_by_people(self) -> tuple[str, ...]:
-        """Return the heliostats whose beams people have aimed, and which keep these aims."""
+        """Return the heliostats that operators have aimed, and that keep these aims."""
         return tuple(json.loads(self._document(_AIMED) or "[]"))
 
     def keep_aimed_by_people(self, heliostats: Sequence[str]) -> None:
-        """Replace the heliostats whose beams people have aimed."""
+        """Replace the set of heliostats that operators have aimed."""
         self._keep_document(_AIMED, json.dumps(list(heliostats)) if heliostats else "")
 
     def _document(self, name: str) -> str:
@@ -538,7 +542,7 @@ def calibration_history(connection: Connection, heliostat: str) -> list[Heliosta
 
 
 def _change_behind(connection: Connection, records: Sequence[HeliostatCalibration]) -> None:
-    """Record the sightings behind versions, as far as they differ from the previous versions."""
+    """Record which sightings are behind versions, where this differs from the previous version."""
     used = tables.parameter_sighting.c
     standing: dict[str, dict[int, bool]] = {record.heliostat: {} for record in records}
     names = list(standing)
@@ -582,7 +586,10 @@ def _last_versions(connection: Connection) -> dict[str, int]:
 
 
 def _locked(hold: Lockout) -> tuple[str, str, str]:
-    """Return the key of a lock: the place and the person. A key has at most one lock in force."""
+    """Return the key of a lock: the place and the person.
+
+    At most one lock is in force for each key.
+    """
     return hold.kind, hold.name, hold.who
 
 

@@ -59,7 +59,7 @@ class Account:
     Attributes
     ----------
     name
-        Unique; case-sensitive.
+        Unique name; case-sensitive.
     role
         One of `ROLES`.
     password_hash
@@ -71,11 +71,11 @@ class Account:
     password_due
         Whether the password must be changed at its next use, because someone else set it.
     factor
-        Whether it has a second factor.
+        Whether the account has a second factor.
     by_proxy
-        Whether it has no password, and a trusted proxy signs that person in.
+        Whether the account has no password, because a trusted proxy signs the person in.
     no_password
-        Whether nobody has set its password yet, so that the person signs in by a one-time link.
+        Whether no password has been set yet, so that the person signs in through a one-time link.
     """
 
     name: str
@@ -97,7 +97,7 @@ class Account:
 
 @dataclass(frozen=True)
 class Session:
-    """A signed-in person: name and current role, start and end.
+    """The session of a signed-in person: name, current role, start and end.
 
     ``key`` identifies the session in lists without revealing its secret.
     """
@@ -127,7 +127,7 @@ class ApiToken:
     label
         Purpose.
     role
-        Its role: at most the current role of its account.
+        Role of the token: at most the current role of its account.
     created, expires, last_used
         POSIX s; None for never.
     """
@@ -184,8 +184,8 @@ _ALIKE = str.maketrans(
 class People:
     """Accounts, sessions and tokens in a database.
 
-    All tables are small: a read takes less than a millisecond, a write one commit. Any thread may
-    call any method.
+    All tables are small, so a read takes less than a millisecond, and a write takes one commit. Any
+    thread may call any method.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ class People:
             return tuple(rows.records(connection, Account, _accounts().order_by(_ACCOUNT.c.name)))
 
     def account(self, name: str) -> Account | None:
-        """Return an account, None if the name is unknown."""
+        """Return an account; None if the name is unknown."""
         with self._database.reading() as connection:
             return _find(connection, name)
 
@@ -228,7 +228,8 @@ class People:
         Raises
         ------
         InputError
-            If the name exists, resembles another, is empty or too long; or the hash is empty.
+            If the name exists already, resembles another name, is empty or too long, or if the hash
+            is empty.
         UnknownNameError
             If the role is unknown.
         StoreError
@@ -271,7 +272,9 @@ class People:
         disabled: bool | None = None,
         due: bool = False,
     ) -> Account:
-        """Change an account. Setting a new password or disabling it ends its sessions and tokens.
+        """Change an account.
+
+        A new password, or disabling the account, ends its sessions and tokens.
 
         A new password that is ``due`` must be changed at first use.
 
@@ -327,7 +330,7 @@ class People:
         self._change((name,), work)
 
     def _change(self, names: Iterable[str], work: Work[T]) -> T:
-        """Change the accounts and tokens of some persons; the change is linked, see `chain`."""
+        """Change the accounts and tokens of some persons; the change is added to the chain."""
 
         def linked(connection: Connection) -> T:
             with chain.changing_accounts(connection, names):
@@ -336,7 +339,7 @@ class People:
         return self._writer.do(linked)
 
     def factors(self, file: Path) -> Factors:
-        """Return the second factors of the accounts; ``file`` holds the key to their secrets."""
+        """Return the second factors of the accounts; ``file`` contains the key to their secrets."""
         return Factors(self._database, self._writer, file, self._entropy)
 
     # -- sessions ------------------------------------------------------------------------
@@ -344,7 +347,7 @@ class People:
     def open_session(self, name: str, now: float, lifetime: float, note: str = "") -> str:
         """Return the secret of a new session, which expires ``lifetime`` s from now.
 
-        If the account has `MOST_SESSIONS` sessions, the oldest ones end.
+        If the account already has `MOST_SESSIONS` sessions, the oldest sessions end.
 
         Raises
         ------
@@ -395,15 +398,16 @@ class People:
     def add_token(
         self, name: str, label: str, role: str, now: float, lifetime: float | None = None
     ) -> tuple[ApiToken, str]:
-        """Create a token for an account; return it with its secret, which is shown only now.
+        """Create a token for an account; return the token and its secret, which is shown only once.
 
-        It expires ``lifetime`` s from now, and at the latest after the `LONGEST` time for its role.
+        The token expires ``lifetime`` s from now, and at the latest after the `LONGEST` time for
+        its role.
 
         Raises
         ------
         InputError
-            If its role is above that of the account, the lifetime is too long, or the account has
-            `MOST_TOKENS` tokens.
+            If the token's role is above the account's role, the lifetime is too long, or the
+            account already has `MOST_TOKENS` tokens.
         UnknownNameError
             If the account or role is unknown.
         StoreError
@@ -437,7 +441,7 @@ class People:
         return made, secret
 
     def token(self, secret: str, now: float) -> ApiToken | None:
-        """Return the token with a secret and record its use; None if there is no valid token."""
+        """Return the token that has a secret, and record its use; None if no valid token has it."""
         with self._database.reading() as connection:
             result = connection.execute(_TOKENS.where(_TOKEN.c.key == _key(secret)))
             row = result.mappings().first()
@@ -476,7 +480,7 @@ class People:
         Raises
         ------
         StoreError
-            If they could not be removed.
+            If the sessions and tokens could not be removed.
         """
         expired, keys = [], []
         with self._database.reading() as connection:
@@ -499,12 +503,12 @@ class People:
 
 
 def _likeness(name: str) -> str:
-    """Return the common form of names that people could confuse."""
+    """Return the form that names share if people could confuse them."""
     return " ".join(unicodedata.normalize("NFKC", name).casefold().translate(_ALIKE).split())
 
 
 def _valid_token(row: RowMapping, now: float) -> ApiToken | None:
-    """Return the token of a row of `_TOKENS`; None if it is not valid."""
+    """Return the token in a row of `_TOKENS`; None if it is not valid."""
     # Earlier programs issued tokens that last for years, or forever.
     ends = row["created"] + LONGEST[row["role"]]
     if row["disabled"] or now >= min(ends, row["expires"] if row["expires"] is not None else ends):
@@ -527,7 +531,7 @@ def _accounts() -> Select[Any]:
 
 
 def _with_state(accounts: FromClause) -> FromClause:
-    """Join the columns that `_STATE` needs to the accounts."""
+    """Join to the accounts the columns that `_STATE` needs."""
     factor = (_FACTOR.c.name == _ACCOUNT.c.name) & _FACTOR.c.confirmed
     return accounts.outerjoin(_DUE, _DUE.c.name == _ACCOUNT.c.name).outerjoin(_FACTOR, factor)
 

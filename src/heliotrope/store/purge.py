@@ -1,7 +1,7 @@
 """Removes everything that a plant stores, before its computer is decommissioned.
 
-Files are overwritten once before they are removed. This is no guarantee by itself, because flash
-memory and copy-on-write file systems keep old blocks; encrypt the disk, or destroy it.
+Files are overwritten once before they are removed. Overwriting alone is no guarantee, because flash
+memory and copy-on-write file systems keep old blocks; therefore encrypt the disk, or destroy it.
 """
 
 import os
@@ -25,7 +25,7 @@ def purge(folder: Path) -> tuple[int, list[Path]]:
 
     Returns
     -------
-    The number of removed files, and what is left in the folder because no plant created it.
+    The number of removed files, and the files left in the folder because no plant created them.
 
     Raises
     ------

@@ -48,7 +48,7 @@ class KeptSightings:
     sightings
         The sightings in order of time.
     kinds, targets, campaigns
-        One word per sighting, "" if not set, (M,).
+        One word per sighting, (M,); "" if not set.
     """
 
     identities: Identities
@@ -62,7 +62,10 @@ class KeptSightings:
         return len(self.identities)
 
     def of(self, heliostat: str) -> Sightings:
-        """Return the sightings of one heliostat, renumbered to 0; empty if its name is unknown."""
+        """Return the sightings of one heliostat, with its heliostat index reset to 0.
+
+        There are no sightings if the name is unknown.
+        """
         row = self.names.index(heliostat) if heliostat in self.names else len(self.names)
         return self.sightings.of(row)
 
@@ -82,11 +85,11 @@ class Event:
     severity
         One of `SEVERITIES`.
     heliostat
-        Heliostat concerned; "" for none.
+        Heliostat concerned; "" if there is none.
     values
         Numeric details by name.
     number
-        Increases for all time; 0 before it is recorded.
+        Number that always increases; 0 before the entry is recorded.
     """
 
     at: float
@@ -109,11 +112,11 @@ class AlarmEntry:
     severity, text
         Severity, and one-line text.
     raised, cleared, acknowledged
-        POSIX s; None if not yet.
+        Times, POSIX s; None if this has not happened yet.
     acknowledged_by
         Operator who acknowledged it; "" if not acknowledged.
     number
-        Increases for all time.
+        Number that always increases.
     """
 
     condition: str
@@ -160,7 +163,7 @@ class Lockout:
 
     @property
     def text(self) -> str:
-        """One line: reason, operator, since when, expected return."""
+        """The lock in one line: reason, operator, since when, expected return."""
         back = f", expected back {_time(self.until)}" if math.isfinite(self.until) else ""
         return f"{self.reason} ({self.who}, since {_time(self.since)}{back})"
 
@@ -194,7 +197,7 @@ class PlannedVisit:
 
 @dataclass(frozen=True)
 class VisitEntry:
-    """A calibration visit made or attempted: what was expected, and what resulted.
+    """A calibration visit that was made or attempted: expectation and result.
 
     Attributes
     ----------
@@ -213,11 +216,11 @@ class VisitEntry:
     sightings
         Number of sightings.
     version
-        Version of the resulting calibration; 0 if none.
+        Version of the resulting calibration; 0 if there is none.
     campaign
-        Name of its campaign; "" for none.
+        Name of its campaign; "" if there is none.
     number
-        Increases for all time; 0 before it is recorded.
+        Number that always increases; 0 before the entry is recorded.
     """
 
     heliostat: str
@@ -256,7 +259,7 @@ class CampaignEntry:
     model, note
         Model of the parameters, and notes.
     expected, found
-        Numeric results by name: the prediction and the outcome.
+        Numeric results by name: as predicted, and as found.
     """
 
     name: str
@@ -301,7 +304,7 @@ class LearningEntry:
     at, person
         Time of learning, POSIX s, and the person who ordered it.
     heliostats, sightings
-        Numbers of heliostats and sightings from which it was learnt.
+        Number of heliostats and number of sightings from which the result was learnt.
     gain
         Increase of a sighting's log probability density, predicted from earlier sightings.
     document
@@ -367,7 +370,7 @@ class Outlook:
     goal
         Tracking error that 90 % of the heliostats must not exceed, rad.
     reached
-        When this is achieved, POSIX s; None if not on this day.
+        When the goal is reached, POSIX s; None if it is not reached on this day.
     points
         The predicted curve, oldest first; the first point is the state at the time of the
         prediction.
@@ -391,7 +394,7 @@ class Outlook:
 
     @classmethod
     def of(cls, made: float, document: str) -> "Outlook":
-        """Return the prediction made at a given time, from its document."""
+        """Return the prediction in a document, which was made at a given time."""
         own = json.loads(document)
         return cls(made, **own | {"points": tuple(FieldPoint(*point) for point in own["points"])})
 
@@ -414,7 +417,7 @@ class PlantFigures:
 
 @dataclass(frozen=True)
 class AuditEntry:
-    """One accepted command, like `plant.orders.audit.Record`; times are ISO 8601."""
+    """One accepted command, as in `plant.orders.audit.Record`; times are in ISO 8601."""
 
     identity: str
     who: str
@@ -439,7 +442,7 @@ class JournalQuery:
     kind
         "event", "alarm", "command" or "note"; "" for all. Notes are events, too.
     person, heliostat, text
-        Person, heliostat, and a text, ignoring case; "" for any.
+        Person, heliostat, and a text whose case is ignored; "" for any.
     but
         Users whose commands are left out.
     limit
@@ -467,13 +470,13 @@ class JournalEntry:
     kind
         "event", "alarm", "command" or "note".
     what
-        Source of an event, condition of an alarm, name of a command.
+        Source of an event, condition of an alarm, or name of a command.
     text
         One line.
     severity
         "" for a command.
     heliostats
-        Names of the first `JOURNAL_NAMES` heliostats of a command to more than five.
+        Names of the first `JOURNAL_NAMES` heliostats, for a command to more than five heliostats.
     """
 
     at: float
@@ -513,12 +516,12 @@ class Records(Protocol):
 
     @property
     def problem(self) -> str:
-        """Why records cannot be written now, as the text of an alarm; empty if they can."""
+        """Why records cannot be written now, as the text of an alarm; "" if they can."""
         ...
 
     @property
     def refused(self) -> str:
-        """The last record rejected because of its content; empty if there is none."""
+        """The last record rejected because of its content; "" if there is none."""
         ...
 
     @property
@@ -539,11 +542,11 @@ class Records(Protocol):
         ...
 
     def record_calibration(self, *records: HeliostatCalibration) -> None:
-        """Record calibrations; each version must be above the recorded ones of its heliostat."""
+        """Record calibrations; a version must exceed all recorded versions of its heliostat."""
         ...
 
     def record(self, fact: Fact) -> None:
-        """Record a fact; if keyed by time or name, it replaces the earlier fact with that key."""
+        """Record a fact; a fact keyed by time or name replaces an earlier fact with that key."""
         ...
 
     def record_event(self, event: Event) -> None:
@@ -562,7 +565,7 @@ class Records(Protocol):
         ...
 
     def hold(self, holds: Sequence[Lockout]) -> None:
-        """Store locks; an operator's new lock replaces that operator's earlier one."""
+        """Store locks; a new lock replaces the same operator's earlier lock on the same object."""
         ...
 
     def unhold(self, holds: Sequence[Lockout], person: str, at: float) -> None:
@@ -574,31 +577,31 @@ class Records(Protocol):
         ...
 
     def exchange_limits(self, numbers: Mapping[str, float]) -> dict[str, float]:
-        """Store the safety-table limits in force; return those of the previous run, or {}."""
+        """Store the safety-table limits in force; return the limits of the previous run, or {}."""
         ...
 
     def emergency(self) -> str:
-        """Return the document about the emergency in force; empty if there is none."""
+        """Return the document about the active emergency; an empty document if there is none."""
         ...
 
     def keep_emergency(self, document: str) -> None:
-        """Replace the document about the emergency in force; empty: the emergency has ended."""
+        """Replace the document about the active emergency; an empty one means that it has ended."""
         ...
 
     def waiting_changes(self) -> str:
-        """Return the document about changes that await approval; empty if there are none."""
+        """Return the document about changes that await approval; an empty document if none do."""
         ...
 
     def keep_waiting_changes(self, document: str) -> None:
-        """Replace the document about changes that await approval; empty: there are none."""
+        """Replace the document about changes that await approval; an empty one means none do."""
         ...
 
     def aimed_by_people(self) -> tuple[str, ...]:
-        """Return the heliostats whose beams people have aimed, and which keep these aims."""
+        """Return the heliostats that operators have aimed, and that keep these aims."""
         ...
 
     def keep_aimed_by_people(self, heliostats: Sequence[str]) -> None:
-        """Replace the heliostats whose beams people have aimed."""
+        """Replace the set of heliostats that operators have aimed."""
         ...
 
     async def confirm(self) -> None:
@@ -626,7 +629,7 @@ class Records(Protocol):
         until: float = float("inf"),
         campaign: str = "",
     ) -> KeptSightings:
-        """Return sightings by time, for some heliostats (None: all) and one campaign if given."""
+        """Return sightings by time, for some heliostats (None: all) and optionally one campaign."""
         ...
 
     def latest_calibrations(
@@ -644,7 +647,7 @@ class Records(Protocol):
         ...
 
     def figures(self, since: float, until: float) -> list[PlantFigures]:
-        """Return the plant's time series from a start time to before an end time, oldest first."""
+        """Return the plant's time series between two times, oldest first; the end is excluded."""
         ...
 
     def visits(
@@ -681,7 +684,10 @@ class Records(Protocol):
         severity: Severity = Severity.INFO,
         before: int = 0,
     ) -> list[Event]:
-        """Return events of at least a given severity, latest first; before a number if given."""
+        """Return events of at least a given severity, latest first.
+
+        If a number is specified, only events with lower numbers are returned.
+        """
         ...
 
     def alarms(

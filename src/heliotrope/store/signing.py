@@ -62,12 +62,12 @@ class SigningKey:
     Parameters
     ----------
     path
-        Its file.
+        File of the key.
 
     Raises
     ------
     FormatError
-        If it cannot be read, others may read it, or it is not such a key.
+        If the file cannot be read, other users may read it, or it is not such a key.
     """
 
     def __init__(self, path: Path) -> None:
@@ -87,7 +87,7 @@ class SigningKey:
         self._key: Ed25519PrivateKey = key
 
     def sign(self, data: bytes) -> bytes:
-        """Return the signature of some data as one line of text."""
+        """Return the signature of some data, as one line of text."""
         signature: bytes = self._key.sign(_PURPOSE + data)
         return base64.b64encode(signature) + b"\n"
 
@@ -98,12 +98,12 @@ class PublicKey:
     Parameters
     ----------
     path
-        Its file.
+        File of the key.
 
     Raises
     ------
     FormatError
-        If it cannot be read, or is not such a key.
+        If the file cannot be read, or is not such a key.
     """
 
     def __init__(self, path: Path) -> None:
@@ -124,7 +124,7 @@ class PublicKey:
         self._key: Ed25519PublicKey = key
 
     def signed(self, data: bytes, signature: bytes) -> bool:
-        """Return whether a signature was made over some data with the private key."""
+        """Return whether a signature of some data was made with the private key."""
         from cryptography.exceptions import InvalidSignature
 
         try:

@@ -52,12 +52,12 @@ Number = BigInteger().with_variant(Integer, "sqlite")
 
 
 def _finite(value: float | None) -> float | None:
-    """Return a float as it is stored: None if it is not finite."""
+    """Return a float as it is stored; None if it is not finite."""
     return float(value) if value is not None and math.isfinite(value) else None
 
 
 def _figure(value: float | None) -> float:
-    """Return a float as it is read: NaN for None."""
+    """Return a float as it is read; NaN if None was stored."""
     return math.nan if value is None else value
 
 
@@ -71,7 +71,7 @@ class _Converted(TypeDecorator[Any], ABC):
         return self._written(value)
 
     def process_result_value(self, value: Any, dialect: Dialect) -> Any:  # noqa: ARG002 - SQLAlchemy gives it
-        """Return a value in the form in which a record holds it."""
+        """Return a value in the form in which a record contains it."""
         return self._read(value)
 
     @abstractmethod
@@ -95,7 +95,7 @@ class Figure(_Converted):
 
 
 class FiguresByName(_Converted):
-    """Floats by name, as a JSON object; a non-finite float becomes null, and null is NaN."""
+    """Floats by name, as a JSON object; non-finite floats become null, and null is read as NaN."""
 
     impl = JSON
     cache_ok = True

@@ -5,8 +5,8 @@ and, while it is being written, ``0003.part``, a stream of Arrow batches. A part
 its last complete batch whatever happened to its writer. When it is long enough, when its day has
 ended, and at the next start, it is converted to a Parquet file: written under a temporary name,
 synced and renamed. A row is written when it differs from the last row of its heliostat, and every
-keyframe contains all rows, so the state of the field at any time follows from the rows of the
-preceding keyframe interval.
+keyframe contains all rows. The state of the field at any time therefore follows from the rows of
+the preceding keyframe interval.
 
 Columns: ``time``, ``heliostat``, ``state``, ``fault``, ``flags``, ``primary`` and ``secondary``
 (counts), ``age`` (s, of the values at that time). `telemetry_query` runs SQL queries.
@@ -61,9 +61,9 @@ class TelemetrySettings:
     keyframe
         Interval between two snapshots that are written completely, s.
     deadband
-        Motion of a drive up to which nothing is written, steps.
+        Largest motion of a drive that is not written, steps.
     days
-        Number of days kept besides the current one.
+        Number of days kept in addition to the current day.
     rows
         Number of rows in a segment.
     """
@@ -94,7 +94,7 @@ class Look:
     Attributes
     ----------
     state
-        Codes; `STALE` if the values are stale, (N,).
+        Codes, (N,); `STALE` if the values are stale.
     fault, flags
         Codes, (N,).
     counts
@@ -172,7 +172,7 @@ class Telemetry:
         at
             POSIX s.
         look
-            N rows; must not be changed afterwards.
+            N rows, which must not be changed afterwards.
         """
         elapsed = at - self._looked_at
         if 0.0 <= elapsed < self.settings.period:
@@ -273,7 +273,7 @@ class _Segment:
         self.rows += batch.num_rows
 
     def close(self) -> None:
-        """Leave the part as it is."""
+        """Close the file, and leave the part as it is."""
         try:
             self._file.close()
         except OSError:
@@ -281,9 +281,13 @@ class _Segment:
 
 
 def changed(last: Look, look: Look, deadband: int) -> npt.NDArray[np.bool_]:
-    """Return the mask of changed rows, (N,): state, fault, flags, or counts beyond a deadband.
+    """Return a mask of the changed rows, (N,).
 
-    A row that was stale and still is does not count as changed, because nothing is known about it.
+    A row has changed if its state, fault or flags differ, or its counts differ by more than a
+    deadband.
+
+    A row that was stale and still is stale does not count as changed, because nothing is known
+    about it.
     """
     moved = np.abs(look.counts.astype(np.int64) - last.counts).max(axis=-1) > deadband
     other = (look.fault != last.fault) | (look.flags != last.flags) | moved
@@ -314,7 +318,7 @@ def read_part(path: Path) -> list[pa.RecordBatch]:
 
 
 def finish_parts(folder: Path) -> None:
-    """Convert all parts of an archive to Parquet; none of them may be open."""
+    """Convert all parts of an archive to Parquet; no part may be open."""
     for part in sorted(folder.glob("????-??-??/*.part")):
         final = part.with_suffix(".parquet")
         # A crash between the two steps below leaves both files; the Parquet file is then complete.
@@ -354,12 +358,12 @@ def _write_parquet(table: pa.Table, final: Path) -> None:
 
 
 def _new_file(path: Path, how: int) -> BinaryIO:
-    """Open a file for writing that only this user may read, and return it."""
+    """Open a file for writing, which only this user may read, and return it."""
     return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | how, PRIVATE), "wb")
 
 
 def retain(folder: Path, days: int, today: date) -> list[str]:
-    """Remove the days of an archive that are older than the given number; return them."""
+    """Remove the days of an archive beyond a given number of days; return the removed days."""
     removed = []
     for place in sorted(folder.glob("????-??-??")):
         try:

@@ -1,4 +1,4 @@
-"""SQL queries on the telemetry archive, by DuckDB; read-only.
+"""Runs read-only SQL queries on the telemetry archive, with DuckDB.
 
 The table is called ``telemetry``; `telemetry` lists its columns; times are UTC without a time zone.
 The current day is included up to its last complete batch.
@@ -33,7 +33,7 @@ def query(folder: str | Path, sql: str, parameters: Sequence[Any] = ()) -> pa.Ta
     folder
         Folder of the archive.
     sql
-        One read-only statement, such as ``SELECT heliostat, max(time) FROM telemetry WHERE
+        A read-only statement, such as ``SELECT heliostat, max(time) FROM telemetry WHERE
         state = ? GROUP BY ALL``. It has no access to files, settings or variables.
     parameters
         Values for its placeholders.
@@ -96,7 +96,7 @@ def _line(error: Exception) -> str:
 
 
 def _content(folder: Path) -> tuple[list[str], pa.Table]:
-    """Return the Parquet files, and the rows of parts not included in them."""
+    """Return the Parquet files, and the rows of parts that are not in these files."""
     for _ in range(_TRIES):
         paths = sorted(folder.glob("????-??-??/*.*"))
         files = [p for p in paths if p.suffix == ".parquet"]

@@ -1,10 +1,10 @@
-"""One writing thread behind a bounded queue, with one commit for everything that is waiting.
+"""A writing thread behind a bounded queue, which commits all waiting jobs together.
 
 A caller queues a job and continues. The thread takes all queued jobs, runs them in one transaction,
-and only then notifies the callers. If the database fails (disk full, read-only, server down)
-nothing is lost and the queue is kept: the thread retries, and `Writer.problem` states the reason. A
-job that the database rejects because of its content (not because of the disk) is dropped and
-reported in `Writer.refused`, and does not hold up other jobs.
+and only then notifies the callers. If the database fails (disk full, read-only, server down), no
+job is lost and the queue is kept: the thread retries, and `Writer.problem` states the reason. A job
+that the database rejects because of its content (not because of the disk) is dropped and reported
+in `Writer.refused`, and does not hold up other jobs.
 """
 
 import threading
@@ -40,7 +40,10 @@ _LINGER = 0.05
 
 @dataclass
 class _Entry:
-    """A waiting job, ``kept`` until it is written or else dropped after one attempt."""
+    """A waiting job.
+
+    If ``kept``, it is retried until it is written; otherwise it is dropped after one attempt.
+    """
 
     work: Work[Any]
     future: "Future[Any] | None"
@@ -84,7 +87,7 @@ class Writer:
 
     @property
     def crowded(self) -> str:
-        """Why no more jobs are accepted; empty while there is room."""
+        """Why no more jobs are accepted; "" while there is room."""
         if len(self._queue) < self._limit:
             return ""
         return (
@@ -110,8 +113,8 @@ class Writer:
         Raises
         ------
         StoreError
-            If it could not be written now; the job is dropped. After a timeout (s) it may still be
-            written, so repeating the job must do no harm.
+            If the job could not be written now; the job is dropped. After a ``timeout``, s, it may
+            still be written, so repeating the job must do no harm.
         """
         future = self.attempt(work)
         try:
@@ -138,7 +141,7 @@ class Writer:
         return future
 
     def confirmed(self) -> "Future[None]":
-        """Return a future that is done once all earlier jobs are stored, or fails with them."""
+        """Return a future that is done once all earlier jobs are stored, or fails if they fail."""
         return self.attempt(_nothing)
 
     def close(self, timeout: float = 10.0) -> None:
@@ -147,7 +150,7 @@ class Writer:
         Raises
         ------
         StoreError
-            If something could not be written.
+            If a job could not be written.
         """
         with self._news:
             self._closing = True
@@ -225,7 +228,7 @@ class Writer:
         return True
 
     def _write_singly(self, batch: list[_Entry], entries: list[_Entry]) -> bool:
-        """Find the job that was rejected; the rest of its batch is written."""
+        """Find the job that was rejected; write the rest of its batch."""
         retried = {id(entry) for entry in entries}
         self._remove([entry for entry in batch if id(entry) not in retried])
         for count, entry in enumerate(entries):
@@ -284,7 +287,7 @@ class Writer:
             self.refused, self.refused_count = text, self.refused_count + 1
 
     def _fail(self, entries: list[_Entry], error: Exception) -> None:
-        """Notify waiting callers, whose jobs are dropped; kept jobs stay queued in order."""
+        """Notify waiting callers that their jobs are dropped; kept jobs stay queued, in order."""
         why = str(error) if isinstance(error, StoreError) else cause(error)
         self.problem = f"store {self._database.name}: cannot be written ({why}); check the disk"
         with self._news:

@@ -2,8 +2,8 @@
 
 A download is written to the file name with the suffix ``.part`` and renamed when it is complete and
 verified. ETag, date and size are kept in a journal, one line of JSON per file, so that a later run
-only asks the server whether the file has changed, and an interrupted download resumes only if it
-has not. `docs/decisions` explains why pooch is not used.
+only asks the server whether the file has changed, and an interrupted download resumes only if the
+file is unchanged. `docs/decisions` explains why pooch is not used.
 """
 
 import errno
@@ -37,11 +37,14 @@ class NotFoundError(FetchError):
 
 
 class StoppedError(FetchError):
-    """Another download failed or the user interrupted; completed parts are kept."""
+    """The download stopped because another one failed or the user interrupted it.
+
+    Completed parts are kept.
+    """
 
 
 class _LaterError(Exception):
-    """A temporary failure; the server may request a pause (s) before the next attempt."""
+    """A temporary failure; the server may request a pause, s, before the next attempt."""
 
     def __init__(self, problem: str, pause: float = 0.0) -> None:
         super().__init__(problem)
@@ -55,9 +58,9 @@ class FileRecord:
     Attributes
     ----------
     etag, modified
-        ETag and Last-Modified; empty if missing.
+        ETag and Last-Modified headers; "" if missing.
     size
-        Bytes of the whole file; −1 if not known.
+        Size of the whole file, bytes; −1 if unknown.
     done
         Whether the file is complete.
     """
@@ -168,7 +171,7 @@ def download(job: RemoteFile, channel: Channel) -> bool:
     Raises
     ------
     FetchError
-        If it cannot be downloaded, differs from the catalogue, or cannot be stored.
+        If the file cannot be downloaded, differs from the catalogue, or cannot be stored.
     """
     if job.sha256 is not None and job.path.is_file() and _sha256(job.path) == job.sha256:
         return False
@@ -189,7 +192,7 @@ def get_document(url: str, channel: Channel) -> tuple[Any, str]:
     Raises
     ------
     FetchError
-        If it cannot be downloaded, is larger than 64 MiB or is not JSON.
+        If the document cannot be downloaded, is larger than 64 MiB or is not JSON.
     """
 
     def attempt() -> tuple[Any, str]:
@@ -312,12 +315,15 @@ def _if_changed(entry: FileRecord) -> dict[str, str]:
 
 
 def _unchanged_mark(entry: FileRecord) -> str:
-    """Return the value for If-Range: a weak ETag does not promise the same bytes."""
+    """Return the value for If-Range, which is never a weak ETag.
+
+    A weak ETag does not guarantee the same bytes.
+    """
     return entry.modified if entry.etag.startswith("W/") or not entry.etag else entry.etag
 
 
 def _fits(response: "httpx.Response", start: int) -> bool:
-    """Return whether the reply to a range request is that range; otherwise it is the whole file."""
+    """Return whether the reply fits a range request: it is that range, or the whole file."""
     if response.status_code == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
         return False
     span = response.headers.get("content-range", "")
@@ -325,7 +331,7 @@ def _fits(response: "httpx.Response", start: int) -> bool:
 
 
 def _whole(response: "httpx.Response") -> int:
-    """Return the size of the whole file, −1 if the reply does not state it."""
+    """Return the size of the whole file; −1 if the reply does not state it."""
     if response.headers.get("content-encoding", "identity") != "identity":
         return -1
     if response.status_code == HTTPStatus.PARTIAL_CONTENT:
@@ -379,7 +385,7 @@ def _json(url: str, content: bytes) -> Any:
 
 
 def _size(path: Path | None) -> int:
-    """Return the size of a file, −1 if there is none."""
+    """Return the size of a file; −1 if there is no file."""
     return path.stat().st_size if path is not None and path.is_file() else -1
 
 

@@ -1,4 +1,4 @@
-"""Numbers with units in the attributes of a HelioK document."""
+"""Reads numbers with units from the attributes of a HelioK document."""
 
 import math
 import re
@@ -22,7 +22,7 @@ class Values:
     Parameters
     ----------
     document
-        Its root must be HelioK and name the units.
+        The document; its root must be HelioK and name the units.
 
     Raises
     ------
@@ -56,7 +56,7 @@ class Values:
         return value
 
     def child(self, element: XmlElement, tag: str) -> XmlElement:
-        """Return the only child element of that name."""
+        """Return the only child element of a given name."""
         children = list(element.elements(tag))
         if len(children) != 1:
             raise self.error(

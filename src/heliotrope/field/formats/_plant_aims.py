@@ -1,4 +1,4 @@
-"""How aims are chosen, in the plant file: read and written."""
+"""Reads and writes the plant file's settings for choosing aims."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ _KEYS = {
 
 
 def build_aims(table: AimsTable | None, folder: Path) -> AimSettings:
-    """Return the settings of a table; maps and tables of limits are read from a folder's files.
+    """Return the settings in a table; limit maps and limit tables are read from files in a folder.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Marks and cameras in a plant file: from tables to objects, and back."""
+"""Converts marks and cameras between plant-file tables and objects."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Settings of joint and receiver visits in the plant file, read and written."""
+"""Reads and writes the settings of joint and receiver visits in the plant file."""
 
 from dataclasses import MISSING, fields
 from typing import Any
@@ -25,14 +25,17 @@ def build_joint(table: JointVisitsTable | None) -> JointSettings | None:
 
 
 def build_receiver_visits(table: ReceiverVisitsTable | None) -> ReceiverSettings | None:
-    """Return the settings of a table, see `build_joint`; None without one."""
+    """Return the settings of a table; None if there is no table. See `build_joint`."""
     return None if table is None else ReceiverSettings(**_values(table, ReceiverSettings))
 
 
 def coded_document(
     joint: JointSettings | None, receiver: ReceiverSettings | None
 ) -> dict[str, dict[str, Any]]:
-    """Return the part of the document with these tables: values that differ from defaults."""
+    """Return the part of the document with these tables.
+
+    Only values that differ from their defaults are written.
+    """
     tables = {}
     if joint is None:
         tables["joint_visits"] = {"allowed": False}
@@ -58,7 +61,7 @@ def _values(table: StrictTable | None, made: type[CodedSettings]) -> dict[str, A
 
 
 def _table(settings: CodedSettings) -> dict[str, Any]:
-    """Return the table of settings: those that have no default or differ from it.
+    """Return the table of the settings that have no default or differ from their default.
 
     Angles are written in radians, to preserve their last digit.
     """

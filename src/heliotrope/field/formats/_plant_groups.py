@@ -1,4 +1,4 @@
-"""Groups in a plant file: from tables to mechanisms and drive settings, and back without loss."""
+"""Converts groups between plant-file tables and mechanisms with drive settings, without loss."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -58,7 +58,7 @@ def build_group(
     Raises
     ------
     FormatError, InputError
-        The group cannot be built.
+        If the group cannot be built.
     """
     reader = _Reader(path, name, group, table, rows)
     position = np.stack([table.numbers[c][rows] for c in _POSITION], axis=-1)
@@ -96,7 +96,7 @@ def build_group(
 
 
 class _Reader:
-    """Numbers of one group: from a column of the table if there is one, otherwise from the TOML."""
+    """Reads the numbers of one group: from a table column if there is one, else from the TOML."""
 
     def __init__(
         self,
@@ -113,7 +113,7 @@ class _Reader:
         return FormatError(self.path, problem, place)
 
     def column(self, key: str) -> FloatArray | None:
-        """Return the table's column for this group; None if it is missing or empty for all."""
+        """Return the table's column for this group; None if it is missing or entirely empty."""
         column = self.table.column(key, self.rows)
         if column is None or np.isnan(column).all():
             return None
@@ -128,7 +128,7 @@ class _Reader:
         return column
 
     def columns(self, start: str) -> tuple[str, ...]:
-        """Return the columns whose names begin with ``start``, with numbers of this group."""
+        """Return the columns whose names begin with ``start`` and that this group fills."""
         names = (name for name in self.table.numbers if name.startswith(start))
         return tuple(name for name in names if self.column(name) is not None)
 
@@ -139,7 +139,7 @@ class _Reader:
         return None if value is None else np.asarray(value, dtype=np.float64)
 
     def array(self, key: str, value: Any) -> FloatArray:
-        """Return an array of numbers (N, …); columns ``key.i.j`` replace single elements."""
+        """Return an array of numbers, (N, …); columns ``key.i.j`` replace individual elements."""
         base = np.asarray(value, dtype=np.float64)
         full = np.array(np.broadcast_to(base, (len(self.rows), *base.shape)))
         for index in np.ndindex(base.shape):
@@ -294,7 +294,7 @@ class _Reader:
         return parameters
 
     def machines(self, mechanism: Mechanism) -> tuple[Machine, ...]:
-        """Return the machine of each heliostat; () if the group has no such table."""
+        """Return the machine of each heliostat; () if the group has no machine table."""
         table = self.group.machine
         if table is None:
             if any(column.startswith("machine.") for column in self.table.numbers):
@@ -356,7 +356,7 @@ class _Reader:
         return tuple(machines)
 
     def axis(self, drive: Drive, where: str, table: AxisTable) -> npt.NDArray[np.int64]:
-        """Return low, high, rate, acceleration and backlash of one axis, (N, 5)."""
+        """Return the lower and upper limit, rate, acceleration and backlash of one axis, (N, 5)."""
         stops = (slot.MIN_ANGLE, slot.MAX_ANGLE)
         self.check_axis(drive, where, table)
         ends = [
@@ -378,7 +378,7 @@ class _Reader:
         return np.round(np.stack(columns, axis=-1)).astype(np.int64)
 
     def check_axis(self, drive: Drive, where: str, table: AxisTable) -> None:
-        """Check that the stops and the rate of an axis are specified, here or by its drive."""
+        """Check that the stops and the rate of an axis are specified, here or in its drive."""
         given = (
             ("min_deg", (table.min_steps, table.min_deg), slot.MIN_ANGLE),
             ("max_deg", (table.max_steps, table.max_deg), slot.MAX_ANGLE),
@@ -398,7 +398,7 @@ class _Reader:
     def end(
         self, drive: Drive, where: str, steps: int | None, deg: float | None, stop: int
     ) -> FloatArray:
-        """Return one end of an axis, steps, (N,): as specified, or the stop of its drive."""
+        """Return one limit of an axis, steps, (N,): as specified, or else the stop of its drive."""
         counts = self.number(f"{where}_steps", steps)
         angle = self.number(f"{where}_deg", deg)
         if counts is not None and angle is not None:
@@ -424,7 +424,7 @@ class _Reader:
         defocus: FloatArray,
         joints: Sequence[str],
     ) -> None:
-        """Check that the largest rotation of a DEFOCUS, with its spread, ends in time."""
+        """Check that the largest rotation of a DEFOCUS, including its spread, ends in time."""
         low, high, rate, ramp, _ = np.stack(axes, axis=1).transpose(2, 0, 1).astype(np.float64)
         steps = np.abs(defocus / drives.radians_per_count(0.5 * (low + high)))
         time = steps / rate + rate / ramp
@@ -466,7 +466,7 @@ def _column(mechanism: Mechanism, name: str) -> str:
 def group_document(
     name: str, heliostats: Heliostats, place: Path
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the TOML of a group, and columns of the values that differ between its heliostats.
+    """Return the TOML of a group, and columns for the values that differ between its heliostats.
 
     Slope maps are written beside the plant file at ``place``.
     """
@@ -481,7 +481,7 @@ def group_document(
         columns |= {f"aim_{c}": heliostats.aim[:, k] for k, c in enumerate(_POSITION)}
 
     def first(key: str, array: npt.NDArray[Any]) -> Any:
-        """Return the numbers of the first heliostat; where others differ, add a column for all."""
+        """Return the numbers of the first heliostat; if other heliostats differ, add a column."""
         for index in np.ndindex(array.shape[1:]):
             values = array[(slice(None), *index)]
             if (values != values[0]).any():
@@ -525,7 +525,7 @@ def group_document(
 def _machine_document(
     heliostats: Heliostats, first: Callable[[str, npt.NDArray[Any]], Any]
 ) -> dict[str, Any]:
-    """Return the table of the machines; ``first`` puts numbers that differ into columns."""
+    """Return the machine table; ``first`` puts numbers that differ into columns."""
     machines, m = heliostats.machines, heliostats.mechanism
     joints = [m.joints[d] for d in m.driven]
     axes = {}

@@ -1,4 +1,4 @@
-"""The surfaces of a group's mirrors in a plant file: read and written."""
+"""Reads and writes the mirror surfaces of a group in a plant file."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -35,7 +35,7 @@ class _Numbers(Protocol):
 
 
 def read_facets(reader: _Numbers, size: tuple[FloatArray, FloatArray], site: Site) -> Facets | None:
-    """Return the facets of a group; those of a grid are not yet canted.
+    """Return the facets of a group; the facets of a grid are not yet canted.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def read_facets(reader: _Numbers, size: tuple[FloatArray, FloatArray], site: Sit
 
 
 def _check_keys(reader: _Numbers, table: MirrorTable) -> None:
-    """Refuse keys that exclude each other, and columns of the table that are not valid keys."""
+    """Refuse keys that exclude each other, and table columns that are not valid keys."""
     kinds = {
         "mirror.facets": table.facets,
         "mirror.facet": table.facet,
@@ -138,7 +138,7 @@ def _canting(reader: _Numbers, table: MirrorTable, site: Site) -> Canting:
 def read_surface(
     reader: _Numbers, names: tuple[str, ...], facets: Facets, *, whole: bool
 ) -> MirrorSurface | None:
-    """Return curvature, errors and measured slopes of a group; None if nothing is known.
+    """Return the curvature, errors and measured slopes of a group; None if nothing is known.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def read_surface(
     names
         Names of its heliostats.
     facets
-        Facets of the heliostats; the whole mirror if it has none.
+        Facets of the heliostats; the whole mirror counts as one facet if it has none.
     whole
         Whether the mirror has no facets.
 
@@ -177,7 +177,7 @@ def read_surface(
 
 
 def _full(reader: _Numbers, value: FloatArray | None) -> FloatArray | None:
-    """Return a number of each heliostat, (N,)."""
+    """Return one number for each heliostat, (N,)."""
     if value is None:
         return None
     return as_float(np.array(np.broadcast_to(value, reader.array("", 0.0).shape)))
@@ -186,7 +186,7 @@ def _full(reader: _Numbers, value: FloatArray | None) -> FloatArray | None:
 def _of_facets(
     reader: _Numbers, table: MirrorTable, key: str, values: list[float] | None, *, whole: bool
 ) -> FloatArray | None:
-    """Return a value per mirror, (N,), or per facet if facets differ, (N, F)."""
+    """Return one value per mirror, (N,), or one per facet, (N, F), if facets differ."""
     if values is not None:
         return reader.array(f"mirror.facet_{key}", values)
     mirror = _full(reader, reader.number(f"mirror.{key}", getattr(table, key)))

@@ -55,13 +55,13 @@ Made = TypeVar("Made", bound=StrictTable)
 
 
 class PlantNameTable(StrictTable):
-    """``[plant]``."""
+    """``[plant]``: the name of the plant."""
 
     name: str = Field(min_length=1)
 
 
 class PlantSiteTable(StrictTable):
-    """``[site]``: the origin of ENU, and its air."""
+    """``[site]``: the origin of ENU, and the atmosphere there."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90, allow_inf_nan=False)]
     longitude_deg: Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)]
@@ -73,7 +73,7 @@ class PlantSiteTable(StrictTable):
 
 
 class MarkTable(StrictTable):
-    """A mark on a target: L, T, square, disc, tag or taught picture."""
+    """A mark on a target: L, T, square, disc, tag or reference picture."""
 
     name: str = Field(min_length=1)
     kind: Literal["corner", "tee", "square", "disc", "tag", "picture"]
@@ -85,7 +85,7 @@ class MarkTable(StrictTable):
 
 
 class TargetTable(StrictTable):
-    """``[[targets]]``: four corners from the upper left, seen from the front, or a size."""
+    """``[[targets]]``: a target, specified by a size or by four corners from the upper left."""
 
     name: str = Field(min_length=1)
     corners_m: Annotated[list[Vector], Field(min_length=4, max_length=4)] | None = None
@@ -98,7 +98,7 @@ class TargetTable(StrictTable):
 
 
 class ReceiverTable(StrictTable):
-    """``[[receivers]]``."""
+    """``[[receivers]]``: a receiver."""
 
     name: str = Field(min_length=1)
     kind: Literal["planar", "convex_cylinder", "external_cylinder", "cavity", "mesh"] = "planar"
@@ -136,7 +136,7 @@ class TowerTable(StrictTable):
 
 
 class CameraTable(StrictTable):
-    """``[[cameras]]``: a pinhole with distortion, in the convention of OpenCV."""
+    """``[[cameras]]``: a pinhole camera with distortion, in OpenCV's convention."""
 
     name: str = Field(min_length=1)
     size_px: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=2)]
@@ -207,7 +207,7 @@ AnyVolume = Annotated[
 
 
 class ChainTable(StrictTable):
-    """``chain``: a mechanism number by number, as the program writes it."""
+    """``chain``: the individual numbers of a mechanism, as the program writes them."""
 
     joints: list[str]
     driven: list[int]
@@ -220,7 +220,7 @@ class ChainTable(StrictTable):
 
 
 class RawDrive(StrictTable):
-    """A drive number by number, as the program writes it."""
+    """The individual numbers of a drive, as the program writes them."""
 
     kind: Literal["raw"]
     numbers: dict[str, float]
@@ -287,7 +287,7 @@ class AxisTable(StrictTable):
 
 
 class SteppingTable(StrictTable):
-    """``[groups.NAME.machine.stepping]``: the motors' drivers."""
+    """``[groups.NAME.machine.stepping]``: the drivers of the stepper motors."""
 
     microsteps: Annotated[
         list[Annotated[int, Field(ge=1, le=256)]], Field(min_length=2, max_length=2)
@@ -299,7 +299,7 @@ class SteppingTable(StrictTable):
 
 
 class MachineTable(StrictTable):
-    """``[groups.NAME.machine]``: what local controllers store besides the calibration."""
+    """``[groups.NAME.machine]``: settings that local controllers store beside the calibration."""
 
     axes: dict[str, AxisTable] = Field(description="For each driven joint.")
     stow_steps: Annotated[list[Steps], Field(min_length=2, max_length=2)] | None = Field(
@@ -366,7 +366,10 @@ class FacetTable(StrictTable):
 
 
 class MirrorTable(StrictTable):
-    """``[groups.NAME.mirror]``: the surface of the mirrors; without: see `heliotrope flux`."""
+    """``[groups.NAME.mirror]``: the surface of the mirrors.
+
+    For a group without this table, see `heliotrope flux`.
+    """
 
     facets: (
         Annotated[list[Annotated[int, Field(ge=1, le=50)]], Field(min_length=2, max_length=2)]
@@ -452,7 +455,10 @@ class GroupTable(StrictTable):
 
 
 def _with_numbers(settings: type[CodedSettings]) -> Callable[[type[Made]], type[Made]]:
-    """Give a table a key for each number of settings: in its unit, and as the program writes it."""
+    """Add keys to a table for each number of some settings.
+
+    There is one key in the number's unit, and one as the program writes it.
+    """
 
     def made(table: type[Made]) -> type[Made]:
         keys: dict[str, Any] = {}
@@ -473,14 +479,14 @@ def _with_numbers(settings: type[CodedSettings]) -> Callable[[type[Made]], type[
 
 @_with_numbers(JointSettings)
 class JointVisitsTable(StrictTable):
-    """``[joint_visits]``: several heliostats on one target at once, told apart by movements."""
+    """``[joint_visits]``: several heliostats on one target, distinguished by their movements."""
 
     allowed: bool = Field(True, description="False: each heliostat is calibrated on its own.")
 
 
 @_with_numbers(ReceiverSettings)
 class ReceiverVisitsTable(StrictTable):
-    """``[receiver_visits]``: heliostats that shine on a receiver, measured there."""
+    """``[receiver_visits]``: heliostats measured while their beams are on a receiver."""
 
     camera: str = Field(
         min_length=1, description="A camera of known position that sees the receiver."
@@ -504,7 +510,7 @@ class TimetableTable(StrictTable):
 
 
 class ApprovalTable(StrictTable):
-    """``[approval]``: changes by a person that need a second one."""
+    """``[approval]``: manual changes that need the approval of a second engineer."""
 
     parameters: bool = Field(
         False,

@@ -1,4 +1,4 @@
-"""Receivers in a plant file: read and written."""
+"""Reads and writes the receivers in a plant file."""
 
 from pathlib import Path
 from typing import Any
@@ -74,7 +74,7 @@ def receiver_document(receiver: Receiver, number: int, place: Path) -> dict[str,
     Parameters
     ----------
     receiver, number
-        The receiver, and its index among those of the plant.
+        The receiver, and its index among the plant's receivers.
     place
         The plant file.
     """

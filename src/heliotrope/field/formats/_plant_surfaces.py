@@ -1,4 +1,4 @@
-"""Targets and receivers in the text of a plant file, moved and rotated as rigid bodies.
+"""Moves and rotates targets and receivers in the text of a plant file, as rigid bodies.
 
 A surface moves together with everything attached to it: its corners, its additional known points
 and its marks. The tables are tomlkit tables, so that comments and the layout of the file are
@@ -21,7 +21,7 @@ _SIZES = ("width_m", "height_m", "radius_m")
 
 
 def surface_values(table: Any) -> dict[str, str]:
-    """Return the values of a target or a receiver that can be set, by name."""
+    """Return the settable values of a target or a receiver, by name."""
     facing, tilt = _angles(table)
     values = {
         RENAMED: str(table["name"]),
@@ -34,7 +34,7 @@ def surface_values(table: Any) -> dict[str, str]:
 
 
 def set_surface(table: Any, changes: Mapping[str, str]) -> tuple[str, ...]:
-    """Set values of a target or a receiver; return warnings.
+    """Set some values of a target or a receiver; return warnings.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def _corners(table: Any) -> None:
 
 
 def _axes(facing: float, tilt: float) -> FloatArray:
-    """Return the matrix whose columns are right (as seen from the front), up and normal, ENU."""
+    """Return the matrix with columns right (as seen from the front), up and normal, in ENU."""
     azimuth, elevation = np.radians(facing), np.radians(tilt)
     normal = np.array(
         [
@@ -111,7 +111,7 @@ def _axes(facing: float, tilt: float) -> FloatArray:
 
 
 def _angles(table: Any) -> tuple[float, float]:
-    """Return azimuth and elevation of the normal, degrees."""
+    """Return the azimuth and the elevation of the normal, degrees."""
     if "normal" in table:
         normal = normalize(np.array([float(x) for x in table["normal"]]))
     elif "corners_m" in table:
@@ -133,7 +133,7 @@ def _center(table: Any) -> FloatArray:
 
 
 def _points(table: Any) -> Iterator[tuple[str, FloatArray]]:
-    """Yield the single points of a surface beside its centre, by name."""
+    """Yield the individual points of a surface, apart from its centre, by name."""
     for k, corner in enumerate(table.get("corners_m", ())):
         yield f"corners_m.{k}", np.array([float(x) for x in corner])
     for name, point in table.get("markers_m", {}).items():
@@ -143,7 +143,7 @@ def _points(table: Any) -> Iterator[tuple[str, FloatArray]]:
 
 
 def _place(table: Any, name: str) -> Any:
-    """Return the array of a point of `_points`."""
+    """Return the TOML array of a point from `_points`."""
     kind, _, which = name.partition(".")
     if kind == "corners_m":
         return table[kind][int(which)]

@@ -34,16 +34,18 @@ MOST_PROBLEMS = 50
 
 @dataclass(frozen=True)
 class HeliostatColumns:
-    """Columns of the table of heliostats.
+    """Columns of the heliostat table.
 
     Attributes
     ----------
     path
         The file.
-    name, group, cluster Text columns, (N,). numbers
+    name, group, cluster
+        Text columns, (N,).
+    numbers
         Columns of numbers, each (N,), by name.
     problems
-        Errors found in it.
+        Errors found in the table.
     """
 
     path: Path
@@ -54,17 +56,17 @@ class HeliostatColumns:
     problems: list[FormatError] = field(default_factory=list)
 
     def column(self, name: str, rows: npt.NDArray[np.intp]) -> FloatArray | None:
-        """Return the numbers of a column at ``rows``, None if there is no such column."""
+        """Return the numbers of a column at ``rows``; None if there is no such column."""
         return self.numbers[name][rows] if name in self.numbers else None
 
 
 def read_table(path: Path) -> HeliostatColumns:
-    """Return the table of heliostats.
+    """Return the heliostat table.
 
     Raises
     ------
     FormatError
-        If it is not a table at all; single wrong values are added to ``problems``.
+        If the file is not a table at all; individual wrong values are added to ``problems``.
     """
     rows = read_columns(path)
     rows.need(REQUIRED)
@@ -84,7 +86,7 @@ def read_table(path: Path) -> HeliostatColumns:
 
 
 def read_columns(path: Path) -> Rows:
-    """Return the columns of the table of heliostats, unchanged.
+    """Return the columns of the heliostat table, unchanged.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Keep-out volumes in the plant file, read and written."""
+"""Reads and writes the keep-out volumes in the plant file."""
 
 import math
 from typing import Any

@@ -54,20 +54,20 @@ def write_scenario(
     scenario
         Scenario created by ARTIST's generator; not changed, unless it is ``path``.
     heliostats
-        The group of each heliostat, by name; of kind ``two_jacks``.
+        The group of each heliostat, by heliostat name; the groups are of kind ``two_jacks``.
     origin
         WGS84 latitude and longitude (degrees) and height (m) of the plant's ENU axes.
 
     Returns
     -------
-    By heliostat, the parameters that the format cannot represent, each with its value and unit.
+    The parameters that the format cannot represent, by heliostat, each with its value and unit.
 
     Raises
     ------
     FormatError
-        If the scenario cannot be read, or has another layout.
+        If the scenario cannot be read, or has a different layout.
     InputError
-        If a heliostat is not in the scenario, or of another kind.
+        If a heliostat is not in the scenario, or is of a different kind.
     """
     import h5py
 

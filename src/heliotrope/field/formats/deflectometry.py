@@ -1,4 +1,4 @@
-"""Mirror surfaces measured and published by PAINT (HDF5): points and normals become slopes.
+"""Reads mirror surfaces that PAINT publishes (HDF5), and converts them to slopes.
 
 A file contains the groups ``facet1``, ``facet2``, … of one heliostat, in the order of its
 properties, each with the datasets ``surface_points``, m, and ``surface_normals``, (K, 3), in the
@@ -26,16 +26,17 @@ SUFFIX = ".h5"
 # Maximum number of cells along an edge of a facet, and points per cell, because a mean of few
 # points is noisy.
 _CELLS, _POINTS = 64, 4
-# Minimum fraction of the points that must lie on their facet; the others are at its rim.
+# Minimum fraction of the points that must lie on their facet; the rest may be at its rim.
 _ON_FACET = 0.5
 _WHAT = "a deflectometry file in PAINT's form (.h5)"
 
 
 def find_deflectometry(folder: Path, name: str) -> Path | None:
-    """Return the file of a heliostat, None if there is none.
+    """Return the deflectometry file of a heliostat; None if there is none.
 
-    ``NAME.h5``; or in the folder, or in ``NAME/Deflectometry`` as PAINT's client stores it, the
-    newest ``NAME-filled-TIME-deflectometry.h5``, or else the newest ``NAME-TIME-…``.
+    The file is ``NAME.h5``. Otherwise it is the newest ``NAME-filled-TIME-deflectometry.h5``, or
+    else the newest ``NAME-TIME-…``, in the folder or in ``NAME/Deflectometry``, where PAINT's
+    client stores it.
     """
     own = folder / f"{name}{SUFFIX}"
     if own.exists():
@@ -52,7 +53,7 @@ def find_deflectometry(folder: Path, name: str) -> Path | None:
 def measured_slopes(
     folder: Path, name: str, facets: Facets, focal: npt.ArrayLike = np.inf
 ) -> FloatArray | None:
-    """Return the slope map of a heliostat in a folder, (F, H, W, 2), rad; None if it has none.
+    """Return the slope map of a heliostat from a folder, (F, H, W, 2), rad; None if it has none.
 
     Parameters
     ----------
@@ -62,12 +63,12 @@ def measured_slopes(
     name
         The heliostat.
     facets, focal
-        Of the one heliostat; see `read_deflectometry`.
+        Facets and focal lengths of this heliostat; see `read_deflectometry`.
 
     Raises
     ------
     FormatError
-        As `heliotrope.field.formats.slopes.read_slopes` and `read_deflectometry`.
+        As for `heliotrope.field.formats.slopes.read_slopes` and `read_deflectometry`.
     """
     for suffix in (".npz", ".csv"):
         own = folder / f"{name}{suffix}"
@@ -80,7 +81,7 @@ def measured_slopes(
 def read_deflectometry(
     path: str | Path, facets: Facets, focal: npt.ArrayLike = np.inf
 ) -> FloatArray:
-    """Return the slope deviations of a measured surface from the designed one, (F, H, W, 2), rad.
+    """Return the slope deviations of a measured surface from its design, (F, H, W, 2), rad.
 
     The normals in each cell of a grid are averaged, and holes are filled from the nearest cell.
 
@@ -89,9 +90,9 @@ def read_deflectometry(
     path
         The file.
     facets
-        Facets of the one heliostat, as designed.
+        Facets of this heliostat, as designed.
     focal
-        Their focal lengths, m, () or (F,); infinity: flat.
+        Focal lengths of the facets, m, () or (F,); infinity: flat.
 
     Raises
     ------
@@ -123,7 +124,7 @@ def read_deflectometry(
 
 
 def _cloud(file: Path, root: "h5py.File", facet: str) -> tuple[FloatArray, FloatArray]:
-    """Return points and normals of a facet, (K, 3) each, excluding NaN."""
+    """Return the points and the normals of a facet, each (K, 3), without NaN."""
     import h5py
 
     both = []
@@ -165,7 +166,10 @@ def _gridded(
     normals: FloatArray,
     cells: int,
 ) -> FloatArray:
-    """Return the mean deviation in each cell of facet ``k``, (cells, cells, 2); NaN if empty."""
+    """Return the mean deviation in each cell of facet ``k``, (cells, cells, 2).
+
+    Empty cells are NaN.
+    """
     facets, curve = mirror
     axes, half = facets.axes[0, k], facets.half_size[0, k]
     own = normals @ axes.T

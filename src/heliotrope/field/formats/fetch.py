@@ -65,11 +65,12 @@ class FetchState:
     stage
         "looking" through the catalogue or "fetching" files.
     done, total
-        Documents read and known so far, or files fetched and requested.
+        While looking: documents read, and documents known so far. While fetching: files fetched,
+        and files requested.
     received
         Bytes of files received.
     name
-        Document or file just completed; empty at first.
+        Document or file just completed; "" at first.
     """
 
     stage: str
@@ -172,7 +173,7 @@ def fetch_heliostats(
     progress
         Called for each document, file and chunk of a file.
     client
-        HTTP client with its own timeout; the caller closes it. Default: one for this run.
+        HTTP client with its own timeout; the caller closes it. Default: a new client for this run.
     settings
         Default ``FetchSettings()``.
 
@@ -220,7 +221,7 @@ def fetch_tower(
 
 @dataclass(frozen=True)
 class _Link:
-    """A document of the catalogue, for a heliostat or ("") for the tower."""
+    """A document of the catalogue, for a heliostat or for the tower ("")."""
 
     heliostat: str
     kind: str
@@ -236,7 +237,7 @@ class _Document:
     content: dict[str, Any]
 
     def hrefs(self, *relations: str) -> list[str]:
-        """Return the addresses of links of some relations.
+        """Return the addresses of the links with some relations.
 
         Raises
         ------
@@ -257,7 +258,7 @@ class _Document:
         Raises
         ------
         FetchError
-            If it is not a valid address.
+            If the address is not valid.
         """
         try:
             return urljoin(self.url, href)
@@ -270,7 +271,7 @@ class _Document:
         Raises
         ------
         FetchError
-            If it lists no files, or a file without an address.
+            If the item lists no files, or a file without an address.
         """
         assets = self.content.get("assets")
         if not isinstance(assets, dict) or not all(
@@ -327,7 +328,7 @@ class _Run:
         self._channel = Channel(client, journal, settings.retries, settings.backoff, self._received)
 
     def fetch(self, jobs: list[RemoteFile]) -> list[bool]:
-        """Fetch the files; return for each whether it was downloaded in this run."""
+        """Fetch the files; return, for each file, whether it was downloaded in this run."""
         self._done = self._total = 0
         return self._map("fetching", self._download, jobs)
 
@@ -377,7 +378,7 @@ class _Run:
             ) from None
 
     def _suggestion(self, name: str) -> str:
-        """Return a hint with names close to an unknown one."""
+        """Return a hint that lists names similar to an unknown name."""
         plant = DEFAULT_BASE_URL.rsplit("/", 1)[-1]
         try:
             root = self._document(_Link("", "", f"{self.base}/{plant}-catalog-stac.json"))
@@ -443,7 +444,7 @@ class _Run:
     def _map(
         self, stage: str, work: Callable[[Task], Result], tasks: Sequence[Task]
     ) -> list[Result]:
-        """Return the result of ``work`` for each task, in order; the first failure ends all."""
+        """Return the result of ``work`` for each task, in order; a failure ends all tasks."""
 
         def run_task(task: Task) -> Result:
             result = work(task)
@@ -484,7 +485,7 @@ def _of(heliostat: str, problem: object) -> str:
 
 
 def _distinct(jobs: Iterable[RemoteFile]) -> list[RemoteFile]:
-    """Return the jobs without repetitions.
+    """Return the jobs without duplicates.
 
     Raises
     ------

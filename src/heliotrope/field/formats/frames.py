@@ -13,7 +13,7 @@ from heliotrope.mechanism.kinds import NORTH, UP
 def mirror_frame(normal: npt.ArrayLike) -> FloatArray:
     """Return the mirror's axes (x right, y up, z along the normal) in the chain's last frame.
 
-    Facets are given in these axes. At zero joint angles y is as close to up as the mirror
+    Facets are specified in these axes. At zero joint angles y is as close to up as the mirror
     allows (to north for a mirror that lies face up), and x is to the right as seen from
     the front.
 
@@ -34,7 +34,7 @@ def mirror_frame(normal: npt.ArrayLike) -> FloatArray:
 
 
 def euler_matrix(angles: npt.ArrayLike) -> FloatArray:
-    """Return R = Rz·Ry·Rx, (..., 3, 3), of angles about x, y and z, rad, (..., 3)."""
+    """Return R = Rz·Ry·Rx, (..., 3, 3), for rotations about x, y and z by angles (..., 3), rad."""
     a = as_float(angles)
     sx, sy, sz = np.moveaxis(np.sin(a), -1, 0)
     cx, cy, cz = np.moveaxis(np.cos(a), -1, 0)

@@ -12,14 +12,14 @@ interpret the tree::
       Scene    Node (name, translation, rotation), nested; in it ShapeKit or HeliostatKit ref
 
 The frame is ENU; the sun's azimuth is clockwise from north. For global aiming ``Aiming`` is a point
-in ENU; for local aiming the same element holds a point in the heliostat frame, and the file does
-not state which of the two it is. A rotation is given by three Euler angles about the fixed axes x,
-then y, then z: R = Rz·Ry·Rx. A mirror or any other surface lies in the x-y plane of its own frame,
-with its normal along z.
+in ENU; for local aiming the same element contains a point in the heliostat frame, and the file does
+not state which of the two applies. A rotation is specified by three Euler angles about the fixed
+axes x, then y, then z: R = Rz·Ry·Rx. A mirror or any other surface lies in the x-y plane of its own
+frame, with its normal along z.
 
 A number may be followed by a space and its own unit ("1.000 mrad"). HelioK itself reads ``Angles``
-without a unit as radians, drops their last digit, and ignores ``unitLength``; here the units of the
-root element apply to all numbers.
+without a unit as radians, drops their last digit, and ignores ``unitLength``; in this module the
+units of the root element apply to all numbers.
 """
 
 from collections.abc import Iterator
@@ -148,9 +148,9 @@ class PlacedModel:
     Attributes
     ----------
     name
-        Name of its node.
+        Name of the heliostat's node.
     model
-        Its model.
+        Model of the heliostat.
     position
         ENU metres, (3,).
     orientation
@@ -172,7 +172,7 @@ class PlacedSurface:
     path
         Names of the nodes that contain it, from the outermost to its own.
     surface
-        In ENU metres.
+        The surface, in ENU, m.
     """
 
     path: tuple[str, ...]
@@ -345,7 +345,7 @@ def heliostats(document: Document) -> list[PlacedModel]:
     Raises
     ------
     FormatError
-        As for `models`, and if a node has no name, a name occurs twice or a model is unknown.
+        As for `models`, or if a node has no name, a name occurs twice or a model is unknown.
     """
     values, known = Values(document), models(document)
     by_name: dict[str, PlacedModel] = {}
@@ -404,7 +404,7 @@ def site(document: Document, height: float) -> Site:
 
 
 def sun(document: Document) -> FloatArray:
-    """Return the unit vector to the sun of the document, ENU, (3,).
+    """Return the unit vector to the document's sun, ENU, (3,).
 
     Raises
     ------
@@ -436,8 +436,8 @@ def to_plant(document: Document, site: Site) -> Plant:
     Raises
     ------
     FormatError
-        As for `heliostats` and `surfaces`, and if a mirror has no facet, axes are parallel or a
-        name occurs twice.
+        As for `heliostats` and `surfaces`, or if a mirror has no facet, axes are parallel or a name
+        occurs twice.
     """
     path = document.path or "HelioK document"
     members: dict[tuple[int, int, int], list[PlacedModel]] = {}
@@ -467,7 +467,7 @@ def to_plant(document: Document, site: Site) -> Plant:
 
 
 def _named(placed: list[PlacedSurface]) -> Iterator[tuple[PlacedSurface, str]]:
-    """Name each surface uniquely: a node may hold several surfaces, or have no name."""
+    """Name each surface uniquely, because a node may contain several surfaces or have no name."""
     taken: set[str] = set()
     for surface in placed:
         base = name = (surface.path[-1] if surface.path else "") or "surface"
@@ -480,7 +480,7 @@ def _named(placed: list[PlacedSurface]) -> Iterator[tuple[PlacedSurface, str]]:
 
 
 def _corners(surface: Surface) -> FloatArray:
-    """Return upper left, upper right, lower right and lower left, m, (4, 3)."""
+    """Return the upper left, upper right, lower right and lower left corners, m, (4, 3)."""
     across = 0.5 * surface.width * surface.axes[:, 0]
     up = 0.5 * surface.height * surface.axes[:, 1]
     corners = np.array([up - across, up + across, across - up, -across - up])
@@ -504,7 +504,10 @@ def _receiver(surface: Surface, name: str) -> Receiver:
 
 
 def _group(placed: list[PlacedModel], upright: int) -> Heliostats:
-    """Return heliostats whose primary axes all lie nearest to axis ``upright`` of their frame."""
+    """Return the group of heliostats whose primary axes lie nearest to axis ``upright``.
+
+    The axis belongs to the heliostat frame.
+    """
     models_ = [heliostat.model for heliostat in placed]
     normal, point = np.array([m.normal for m in models_]), np.array([m.point for m in models_])
     first, second = (name for k, name in enumerate(_LEANS) if k != upright)
@@ -555,7 +558,7 @@ def _group(placed: list[PlacedModel], upright: int) -> Heliostats:
 
 
 def _drive(axes: tuple[DrivenAxis, ...]) -> Drive:
-    """Return drives whose counts are radians, one per axis, with its stops."""
+    """Return drives whose counts are radians: one drive per axis, with the stops of the axis."""
     stops = np.array([axis.stops for axis in axes])
     drives = Drive(np.tile(direct().table, (len(axes), 1)))
     return drives.replace(min_angle=stops[:, 0], max_angle=stops[:, 1])

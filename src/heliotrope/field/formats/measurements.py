@@ -1,7 +1,7 @@
 """Camera-target measurements: positions of heliostat beams on a target.
 
 The measurements are read from ``measurements.csv`` or from PAINT's calibration properties. A record
-that cannot be used is left out and named.
+that cannot be used is left out and reported.
 """
 
 from dataclasses import dataclass
@@ -41,13 +41,13 @@ class Measurements:
     heliostat, ids, target
         Names, (M,).
     time
-        Unix seconds (UTC); NaN where only the sun's angles are known, (M,).
+        POSIX seconds (UTC), (M,); NaN where only the sun's angles are known.
     counts
         Motor counts, (M, 2).
     sun
         Apparent sun, unit vectors in ENU, (M, 3).
     centroid
-        Centroid of the beam on the target, ENU metres about the plant's reference, (M, 3).
+        Centroid of the beam on the target, ENU, m, relative to the plant's reference point, (M, 3).
     left_out
         One line for each record that could not be used.
     """
@@ -74,7 +74,7 @@ def read_measurements(folder: str | Path, centroid: Centroid = "utis") -> Measur
         Folder with ``measurements.csv``, or ``ID/Calibration/*-calibration-properties.json``
         (ARTIST omits ``Calibration/``).
     centroid
-        Published extractor whose centroids are used.
+        Name of the published extractor whose centroids are used.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def read_measurements(folder: str | Path, centroid: Centroid = "utis") -> Measur
 
 
 def _read_table(path: Path, centroid: Centroid) -> "tuple[pd.DataFrame, list[str]]":
-    """Return the rows of a table, and a line for each row of another length than the header."""
+    """Return the rows of a table, and a message for each row that is not as long as the header."""
     import pandas as pd
 
     needed = [*_COLUMNS, *(f"{centroid}_{c}" for c in ("lat", "lon", "alt"))]

@@ -41,7 +41,7 @@ def read_mesh(path: str | Path) -> TriangleMesh:
 
 
 def write_mesh(path: str | Path, mesh: TriangleMesh) -> None:
-    """Write a mesh as OBJ, in metres, from which exactly the same mesh is read."""
+    """Write a mesh as OBJ, in metres, so that `read_mesh` returns exactly the same mesh."""
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
     lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces.tolist()]
     write_text(path, "\n".join(lines) + "\n")

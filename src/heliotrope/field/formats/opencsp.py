@@ -5,11 +5,11 @@ The heliostat table has one row per heliostat and these columns, found by name::
     Name, X, Y, Z, Num. Facets, Num. Rows, Num. Cols, Pivot Height, Pivot Offset,
     Facet Width, Facet Height
 
-X is east, Y north, Z up, in m. The position is that of the pivot (the torque tube), not of the
-foot, and the pivot height is for information only. The mirror surface is in front of the pivot by
-the pivot offset. Azimuth is clockwise from north, elevation from the horizon.
+X is east, Y north, Z up, in m. The position is the position of the pivot (the torque tube), not of
+the foot, and the pivot height is for information only. The mirror surface is in front of the pivot
+by the pivot offset. Azimuth is clockwise from north, elevation from the horizon.
 
-The centroid table (Facet id, X, Y, Z) applies to all heliostats of the field. Its frame is that of
+The centroid table (Facet id, X, Y, Z) applies to all heliostats of the field. Its frame belongs to
 a mirror that lies face up and is rotated to face south: X to the right as seen from the front, Y
 up, Z out of the mirror. Facets are listed from the upper left, row by row, and are neither canted
 nor curved in these files.
@@ -53,7 +53,7 @@ _OWN = ("Name", "Num. Facets", "Pivot Height")
 
 @dataclass(frozen=True, eq=False)
 class FieldTable:
-    """The table of heliostats.
+    """The heliostat table.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class FieldTable:
     location
         Positions of the pivots, m east, north and up, (N, 3).
     facets, rows, columns
-        Number of facets, and of rows and columns of them, (N,).
+        Number of facets, and number of rows and columns of facets, (N,).
     pivot_height
         m, (N,).
     pivot_offset
@@ -108,12 +108,12 @@ class Centroids:
 
 
 def read_field(path: str | Path) -> FieldTable:
-    """Read the table of heliostats.
+    """Read the heliostat table.
 
     Raises
     ------
     FormatError
-        If the file cannot be read, a column is missing, a row has another number of cells, a cell
+        If the file cannot be read, a column is missing, a row has the wrong number of cells, a cell
         is invalid for its column, or a name occurs twice; the text states line and column.
     """
     rows = _read(path, "an OpenCSP heliostat field", COLUMNS)
@@ -167,7 +167,7 @@ def _count(rows: Rows, column: str) -> FloatArray:
 
 
 def write_field(path: str | Path, table: FieldTable) -> None:
-    """Write the table of heliostats, with its additional columns, completely or not at all."""
+    """Write the heliostat table, with its additional columns, completely or not at all."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*COLUMNS, *table.extra])
@@ -216,7 +216,7 @@ def to_plant(table: FieldTable, site: Site, centroids: Centroids | None = None) 
     Raises
     ------
     InputError
-        If the number of facets of a heliostat differs from that of the centroids.
+        If a heliostat's number of facets differs from the number of centroids.
     """
     if centroids is not None and (table.facets != len(centroids)).any():
         i = int(np.flatnonzero(table.facets != len(centroids))[0])
@@ -259,7 +259,7 @@ def _group(
 
 
 def _edge_to_edge(rows: int, columns: int, size: FloatArray) -> FloatArray:
-    """Return centres of facets without gaps, from the upper left, (N, rows·columns, 3)."""
+    """Return the centres of facets without gaps, from the upper left, (N, rows·columns, 3)."""
     down, right = np.mgrid[:rows, :columns].reshape(2, -1)
     center = np.zeros((len(size), rows * columns, 3))
     center[..., 0] = (right - 0.5 * (columns - 1)) * size[:, :1]

@@ -37,7 +37,7 @@ def open_plant(
         OpenCSP's table of facet centroids; without it the facets are placed edge to edge.
     templates
         Dimensions of SolarPILOT's heliostats by template number. A layout does not contain them; by
-        default mirrors are 12.2 m × 12.2 m, SolarPILOT's default, and ``notes`` say so.
+        default mirrors are 12.2 m × 12.2 m, SolarPILOT's default, and the plant's ``notes`` say so.
 
     Raises
     ------

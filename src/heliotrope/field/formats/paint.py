@@ -1,7 +1,7 @@
 """PAINT: the published data of the Jülich solar tower (DLR, KIT), as JSON files.
 
-Heliostat properties, tower measurements and calibration properties, in all published variants.
-Positions are WGS84 and are converted exactly.
+This module reads heliostat properties, tower measurements and calibration properties, in all
+published variants. Positions are WGS84 and are converted exactly.
 """
 
 import json
@@ -61,11 +61,12 @@ class Properties:
     translations
         First joint, second joint, concentrator, m, (3, 3).
     tilts
-        Tilts of the joints given in the file, by parameter name, rad.
+        Joint tilts in the file, by parameter name, rad.
     facets
-        Centre and half edges in the mirror's frame, (F, 3) each; empty if not given.
+        Centres and half edges of the facets in the mirror's frame, each (F, 3); empty if the file
+        contains none.
     renovation
-        Date of the last renovation; empty if unknown.
+        Date of the last renovation; "" if unknown.
     """
 
     name: str
@@ -92,7 +93,7 @@ def read_heliostat(path: str | Path, name: str | None = None) -> Properties:
     Raises
     ------
     FormatError
-        If something is missing or invalid; the text names file, key and value.
+        If a value is missing or invalid; the text names file, key and value.
     """
     root = read_json(path, "PAINT heliostat properties")
     chain = root.any_of("kinematics_properties", "kinematic_properties", "kinematic")
@@ -177,7 +178,7 @@ def _facets(root: JsonNode) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Tower:
-    """The tower's file: reference point, targets and receivers.
+    """The contents of the tower file: reference point, targets and receivers.
 
     Attributes
     ----------
@@ -201,7 +202,7 @@ def read_tower(path: str | Path) -> Tower:
     Raises
     ------
     FormatError
-        If something is missing or invalid.
+        If a value is missing or invalid.
     """
     root = read_json(path, "PAINT tower measurements")
     origin = root["power_plant_properties"]["coordinates"].geodetic()
@@ -227,7 +228,7 @@ def read_tower(path: str | Path) -> Tower:
 
 
 def _corners(node: JsonNode, points: dict[str, FloatArray], prefix: str = "") -> FloatArray:
-    """Return the corners from the upper left, as seen from the front."""
+    """Return the corners of a surface, starting at the upper left, as seen from the front."""
     order = ("upper_left", "upper_right", "lower_right", "lower_left")
     for corner in order:
         if prefix + corner not in points:
@@ -246,9 +247,9 @@ def _target(name: str, node: JsonNode, points: dict[str, FloatArray]) -> Target:
 def with_marks(targets: Sequence[Target]) -> tuple[Target, ...]:
     """Return targets with the marks at their measured points at Jülich.
 
-    Ls are at free corners, Ts at edge midpoints and where two targets meet; the points are on their
-    outer edges. This is not in the files; it was measured in published photographs, sizes to within
-    a centimetre.
+    L-shaped marks are at free corners, T-shaped marks at edge midpoints and where two targets meet;
+    the points are on the outer edges of the marks. The files do not contain the marks; these were
+    measured in published photographs, their sizes to within a centimetre.
     """
     marked = []
     for target in targets:
@@ -284,7 +285,7 @@ def _receiver(name: str, kind: str, node: JsonNode, points: dict[str, FloatArray
 def find_properties(folder: str | Path) -> list[Path]:
     """Return the property files of a folder.
 
-    They are ``properties/ID.json``, or as in PAINT (``ID/Properties/…``) or ARTIST
+    The files are named ``properties/ID.json``, or as in PAINT (``ID/Properties/…``) or ARTIST
     (``ID/heliostat-properties.json``).
     """
     root = Path(folder)
@@ -295,7 +296,7 @@ def find_properties(folder: str | Path) -> list[Path]:
 
 
 def heliostat_of(file: Path) -> str:
-    """Return the heliostat of a PAINT or ARTIST file from its folder; empty if unknown."""
+    """Return the heliostat of a PAINT or ARTIST file, known from its folder; "" if unknown."""
     if file.parent.name in ("Properties", "Calibration"):
         return file.parent.parent.name
     own = (file.parent / "heliostat-properties.json").exists()
@@ -303,7 +304,7 @@ def heliostat_of(file: Path) -> str:
 
 
 def find_tower(folder: str | Path) -> Path:
-    """Return the tower's file of a folder, by either of its two names.
+    """Return the tower file in a folder, under either of its two names.
 
     Raises
     ------
@@ -350,7 +351,7 @@ def read_plant(folder: str | Path) -> Plant:
 
 
 def to_heliostats(properties: Iterable[Properties], origin: Origin) -> Heliostats:
-    """Return heliostats as arrays from their properties, about ``origin``."""
+    """Return heliostats as arrays, from their properties, with positions relative to ``origin``."""
     listed = list(properties)
     latitude, longitude, height = np.array([p.geodetic for p in listed]).T
     position = geodetic_to_enu(latitude, longitude, height, origin)
@@ -395,9 +396,10 @@ class CalibrationProperties:
     target
         Name of the target.
     sun_azimuth_deg, sun_elevation_deg
-        0 is south, east positive; refraction included. NaN if the file has none.
+        Azimuth (0 is south, positive towards east) and elevation, including refraction; NaN if the
+        file contains none.
     focal_spots
-        Geodetic centroid by the name of its extractor ("UTIS", "HeliOS").
+        Geodetic centroids, by the name of the extractor ("UTIS", "HeliOS").
     """
 
     motors: tuple[float, float]
@@ -408,7 +410,7 @@ class CalibrationProperties:
 
 
 def read_calibration_properties(path: str | Path) -> CalibrationProperties:
-    """Return one calibration measurement; both published key styles are supported."""
+    """Return one calibration measurement; both published styles of keys are supported."""
     root = read_json(path, "PAINT calibration properties")
     motors = root["motor_position"]
     spots = {name: node.geodetic() for name, node in root["focal_spot"].items() if node.value}
@@ -434,13 +436,13 @@ def write_heliostat(
 
     Returns
     -------
-    The parameters that the format cannot represent, each with its value and unit; a plant file
-    contains them.
+    The parameters that the format cannot represent, each with its value and unit; a plant file does
+    contain these parameters.
 
     Raises
     ------
     InputError
-        If its mechanism is not of kind ``two_jacks``.
+        If the heliostat's mechanism is not of kind ``two_jacks``.
     """
     mechanism = written(heliostats, name)
     i = heliostats.index(name)
@@ -471,7 +473,7 @@ def written(heliostats: Heliostats, name: str) -> Mechanism:
     Raises
     ------
     InputError
-        If the mechanism is of another kind.
+        If the mechanism is of a different kind.
     """
     if heliostats.mechanism.kind != "two_jacks":
         raise InputError(

@@ -25,7 +25,8 @@ from heliotrope.field.heliostats import Heliostats
 from heliotrope.files import read_text, write_file, write_text
 from heliotrope.files.documents import read_toml
 
-#: Smaller units in which a value may be entered, by the unit of its column, and their size in it.
+#: Smaller units in which a value may be entered, by the unit of its column, and their size in this
+#: unit.
 _SMALLER = {"rad": {"mrad": 1e-3, "deg": np.pi / 180.0}, "m": {"mm": 1e-3}}
 _TEXTS = ("cluster", "group")
 _NOTE = "change.txt"
@@ -35,7 +36,7 @@ _STRANGE = 5.0
 
 @dataclass(frozen=True)
 class Change:
-    """A changed value: its name, the old and the new text, and the unit."""
+    """A changed value: its name, its old and new texts, and its unit."""
 
     name: str
     old: str
@@ -52,9 +53,9 @@ class Edited:
     changes
         The values that changed.
     warnings
-        Warnings about the changed file that did not apply to the old one.
+        Warnings about the changed file that did not apply to the old file.
     version
-        Stored version of the file before the change; empty if nothing was written.
+        Stored version of the file before the change; "" if nothing was written.
     """
 
     changes: tuple[Change, ...]
@@ -64,14 +65,14 @@ class Edited:
 
 @dataclass(frozen=True)
 class Version:
-    """A stored version of a plant file: its name (time in UTC), and the change replacing it."""
+    """A stored version of a plant file: its name (time in UTC), and the change that replaced it."""
 
     name: str
     note: str
 
 
 def values(path: str | Path, who: str) -> dict[str, str]:
-    """Return the values of a heliostat, a target or a receiver that can be set, by name.
+    """Return the settable values of a heliostat, a target or a receiver, by name.
 
     Raises
     ------
@@ -108,7 +109,7 @@ def edit(
     now
         The time; default: the system time.
     dry
-        Check, but write nothing.
+        Whether to check the change without writing anything.
 
     Raises
     ------
@@ -140,7 +141,7 @@ def edit(
 
 
 def keep_version(path: str | Path, change: str, *, now: datetime | None = None) -> str:
-    """Store the present version of a plant file, before another part of the program changes it.
+    """Store the present version of a plant file before another part of the program changes it.
 
     Returns the name of the version; ``change`` describes the change that replaces it.
 
@@ -166,7 +167,7 @@ def versions(path: str | Path) -> list[Version]:
 
 
 def restore(path: str | Path, version: str, *, note: str = "", now: datetime | None = None) -> str:
-    """Restore a stored version; return the version name of the replaced file.
+    """Restore a stored version; return the name under which the replaced file was stored.
 
     Raises
     ------
@@ -257,7 +258,7 @@ class _Files:
         return tuple(warnings)
 
     def _column(self, who: str, name: str) -> tuple[str, float]:
-        """Return the column of a name, and the factor of its unit."""
+        """Return the column that a name refers to, and the conversion factor of its unit."""
         group, _ = self.plant.find(who)
         known = dict.fromkeys((*map(str, self.cells.columns), *_TEXTS, *_parameters(group)))
         known.pop("name")
@@ -268,7 +269,7 @@ class _Files:
         raise UnknownNameError(f"value of heliostat {who}", name, known)
 
     def _fill(self, who: str, column: str) -> None:
-        """Set the nominal value of a new column for the other heliostats of the group."""
+        """In a new column, set the nominal value for all other heliostats of the group."""
         group, _ = self.plant.find(who)
         if column not in self.cells.columns:
             self.cells[column] = np.nan if self.table.suffix == ".parquet" else ""
@@ -344,7 +345,7 @@ def _named_files(table: Any, home: Path) -> Iterator[PurePath]:
 
 
 def _parameters(group: Heliostats) -> dict[str, tuple[float, str]]:
-    """Return the columns of a group's parameters: standard deviation of the prior, and unit."""
+    """Return, for each parameter column of a group, the prior's standard deviation and the unit."""
     known = [group.mechanism.parameter(name) for name in group.mechanism.parameters]
     return {
         f"parameters.{parameter.name}" + ("" if parameter.unit == "1" else f"_{parameter.unit}"): (
@@ -356,7 +357,7 @@ def _parameters(group: Heliostats) -> dict[str, tuple[float, str]]:
 
 
 def _readings(name: str) -> Iterator[tuple[str, float]]:
-    """Yield a name unchanged, and with its smaller unit replaced by the unit of the file."""
+    """Yield a name unchanged, and then with its smaller unit replaced by the file's unit."""
     yield name, 1.0
     for unit, smaller in _SMALLER.items():
         for short, size in smaller.items():
@@ -375,7 +376,7 @@ def _versions(path: Path) -> Path:
 
 
 def _keep(place: Path, table: PurePath, change: str, note: str, now: datetime | None) -> str:
-    """Store the files as they are on disk; return the name of the version."""
+    """Store the files as they are on disk; return the name of the stored version."""
     at = (now or datetime.now(UTC)).astimezone(UTC)
     stem, home = at.strftime("%Y-%m-%dT%H%M%SZ"), _versions(place)
     taken = [version.name for version in home.iterdir()] if home.is_dir() else []

@@ -1,8 +1,9 @@
 """Our own format: one TOML file for the plant, with a table of its heliostats beside it.
 
 The TOML file contains what all heliostats share (site, tower, kinds of mechanism, drives); the
-table contains what differs: name, group, position, and any number of the group in a column with its
-dotted name. Files are written at full precision, so that a plant reads back exactly as it was.
+table contains what differs: name, group, position, and any number of the group that differs between
+heliostats, in a column with its dotted name. Files are written at full precision, so that a plant
+reads back exactly as it was.
 """
 
 import itertools
@@ -209,7 +210,7 @@ def _built(
     build: Callable[[Table | None], Made | None],
     problems: list[FormatError],
 ) -> Made | None:
-    """Build from a table that may be missing; an error is added to ``problems``."""
+    """Build an object from a table that may be missing; an error is added to ``problems``."""
     try:
         return build(table)
     except InputError as error:
@@ -285,8 +286,8 @@ def rectangle(center: FloatArray, width: float, height: float, facing: float) ->
 def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"] = "csv") -> None:
     """Write the TOML file and, beside it, the table of the heliostats.
 
-    Both are written under temporary names and then renamed, the table first, so that a reader never
-    sees an incomplete file.
+    Both files are written under temporary names and then renamed, the table first, so that a reader
+    never sees an incomplete file.
 
     Parameters
     ----------
@@ -295,7 +296,7 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
     path
         TOML file; the table has the same name with another suffix.
     table
-        "csv" or "parquet".
+        Format of the table, "csv" or "parquet".
 
     Raises
     ------
@@ -388,7 +389,7 @@ def _warnings(plant: Plant) -> list[str]:
 
 
 def _placing(plant: Plant, surface: Target | Receiver) -> list[str]:
-    """Return the unusual features of a surface's position and orientation."""
+    """Return warnings about unusual features of a surface's position and orientation."""
     what = f"{'target' if isinstance(surface, Target) else 'receiver'} {surface.name}"
     texts, lines = [], plant.position - surface.center
     behind = lines @ surface.normal <= 0.0

@@ -1,4 +1,4 @@
-"""Slope maps of mirrors in files.
+"""Reads and writes slope maps of mirrors.
 
 A map comes from deflectometry (QDec-H and similar systems): for each facet a grid of slope
 deviations from the ideal surface, (F, H, W, 2), along the facet's own right and upward edges. A
@@ -52,7 +52,7 @@ def read_slopes(path: str | Path, facets: int) -> FloatArray:
 
 
 def checked_slopes(file: Path, slope: FloatArray, facets: int) -> FloatArray:
-    """Return a slope map whose holes are filled; errors as in `read_slopes`."""
+    """Return a slope map whose holes are filled; the errors are those of `read_slopes`."""
     if slope.ndim != 4 or slope.shape[3] != 2 or not slope.size:
         raise FormatError(file, f"slopes must have the shape (F, H, W, 2), not {slope.shape}")
     if len(slope) != facets:

@@ -10,9 +10,10 @@ columns by position, so without a header the columns are::
      6 and 4     the columns up to z of either
 
 x is east, y north, z up, in m; z = 0 is the height of the pivots on level ground, so a location is
-that of the pivot, and an aim point is relative to the same origin. The optional groups focus, cant
-and aim are numbers, or NULL for "to be computed". The separator is a comma, a semicolon, a tab or
-spaces; in text passed on by other programs, records may end with a semicolon instead of a line end.
+the position of a pivot, and an aim point is relative to the same origin. The optional groups focus,
+cant and aim are numbers, or NULL for "to be computed". The separator is a comma, a semicolon, a tab
+or spaces; in text passed on by other programs, records may end with a semicolon instead of a line
+end.
 
 SolarPILOT's exports begin with two lines (names, units). With 14 columns the names list "In layout"
 before "Enabled", but in the data "enabled" comes first, as SolarPILOT reads it; the flags are
@@ -169,7 +170,7 @@ def read_layout(path: str | Path, site: Site | None = None) -> Layout:
     Raises
     ------
     FormatError
-        If the file cannot be read, has no rows, a header without positions, rows of differing
+        If the file cannot be read, or has no rows, a header without positions, rows of differing
         length, or a cell that is invalid for its column; the text states line and column.
     """
     file = Path(path)
@@ -211,7 +212,7 @@ def read_layout(path: str | Path, site: Site | None = None) -> Layout:
 def _by_position(
     file: Path, place: str, table: list[list[str]]
 ) -> tuple[list[str], dict[str, str]]:
-    """Return names of the columns of a file without a header, and those names by meaning."""
+    """Return the column names of a file without a header, and the same names by meaning."""
     width = max(k + 1 for k, cell in enumerate(table[0]) if cell)
     if width not in WIDTHS:
         raise FormatError(
@@ -227,7 +228,7 @@ def _by_position(
 
 
 def _by_header(file: Path, place: str, head: list[list[str]]) -> tuple[list[str], dict[str, str]]:
-    """Return unique names of the columns of a header, and the known names by meaning.
+    """Return the column names of a header, made unique, and the known names by meaning.
 
     ``head`` contains the rows without a number: names, and units if there are two rows.
     """
@@ -331,7 +332,10 @@ def _location(rows: Rows, columns: dict[str, str], site: Site | None) -> FloatAr
 
 
 def _group(rows: Rows, columns: dict[str, str], group: tuple[str, ...]) -> FloatArray:
-    """Return columns that in each row are all numbers or all NULL (or empty), which becomes NaN."""
+    """Return some columns, whose entries in a row are all numbers or all NULL.
+
+    NULL and empty entries become NaN.
+    """
     if not all(meaning in columns for meaning in group):
         return np.full((len(rows), len(group)), np.nan)
     names = [columns[meaning] for meaning in group]
@@ -379,10 +383,10 @@ def _is_value(cell: str) -> bool:
 def to_plant(layout: Layout, site: Site, templates: Mapping[int, Template]) -> Plant:
     """Return the plant of a layout: azimuth-elevation heliostats, one group per template.
 
-    The origin of ENU is SolarPILOT's, so up = 0 is the height of the base pivot and the feet are
-    ``pivot_height`` lower. Heliostats that are not enabled or not in the layout are left out and
-    named in ``notes``, as are columns that were not read. Focus and cant are not part of a plant
-    and stay in the layout.
+    The origin of ENU is SolarPILOT's, so up = 0 is the height of the base pivot, and the
+    heliostats' feet are ``pivot_height`` lower. Heliostats that are not enabled or not in the
+    layout are left out and named in ``notes``, as are columns that were not read. Focus and cant
+    are not part of a plant and stay in the layout.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Emergencies: the plant's safety-table rows, and the orders that they require and confirm.
 
-`Sentinel` acts on the table and repeats and confirms orders; everything that starts or ends an
-emergency is in its file. `TableWatch` evaluates the rows. `EmergencyOrder` is one field-wide order
-with the proof that it has been carried out.
+`Sentinel` acts on the table, and repeats and confirms orders; its file contains everything that
+starts or ends an emergency. `TableWatch` evaluates the rows. `EmergencyOrder` is one field-wide
+order with the proof that it has been carried out.
 """
 
 from heliotrope.plant.emergency.order import EmergencyOrder, at_stow, carried_out

@@ -4,8 +4,8 @@ An order that a person repeats merges with the active one and is neither recorde
 that a program that repeats it hundreds of times a second cannot fill the store or the event list.
 If an order is withdrawn while its author (or a program with the author's token) keeps repeating it,
 or is withdrawn by others five times within ten minutes, that person's next order is accepted only
-after a pause. Nobody else is affected. The first order of a person is never refused, nor is the
-first one after another person has withdrawn theirs.
+after a pause. Nobody else is affected. A person's first order is never refused, nor is the first
+order after another person has withdrawn that person's order.
 """
 
 import math
@@ -72,9 +72,9 @@ class Callers:
         Parameters
         ----------
         who, act, reason
-            As for `Call`. A person's order keeps the stronger action and each new reason.
+            As for `Call`. If a person orders again, the stronger action and all reasons are kept.
         at, now
-            POSIX s, and monotonic s.
+            The time of the order, POSIX s, and the present time, monotonic s.
 
         Returns
         -------
@@ -107,7 +107,8 @@ class Callers:
 
         Returns
         -------
-        A message for the operator: how often the order was repeated, and when the next is accepted.
+        A message for the operator: how often the order was repeated, and when the person's next
+        order is accepted.
         """
         self._calls.pop(who, None)
         self._histories = {

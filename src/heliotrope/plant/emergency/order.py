@@ -4,8 +4,8 @@ A heliostat has acknowledged the order when its local controller says so, or whe
 after the order implies it. Whether a heliostat counts as done depends on its state *and* on its
 axes. Its beam is off the receiver when the axes are within `NEAR` of the defocus goals, whatever
 the state is called, and when the beam, computed from step counts and the believed mechanism, is on
-no receiver, because a heliostat at standby may turn its beam onto one. A heliostat with unknown
-step counts is never done; the report says where its beam was last.
+no receiver, because a heliostat at standby may turn its beam onto a receiver. A heliostat with
+unknown step counts is never done; the report says where its beam was last.
 """
 
 from collections.abc import Mapping
@@ -68,14 +68,14 @@ class EmergencyOrder:
 
     @property
     def proof(self) -> Proof:
-        """The proof so far."""
+        """How far the order has been proven to be carried out."""
         if self._acknowledged or self._done:
             self._proof = self._proof.with_news(acknowledged=self._acknowledged, done=self._done)
             self._acknowledged, self._done = {}, {}
         return self._proof
 
     def take_flux(self, share: float, at: float) -> None:
-        """Accept a flux reading, as a fraction of the nominal flux."""
+        """Accept a flux reading, which is a fraction of the nominal flux."""
         self._proof = self.proof.with_flux(share, at)
 
     def is_acknowledged(self, heliostat: str) -> bool:
@@ -87,15 +87,16 @@ class EmergencyOrder:
         )
 
     def is_done(self, heliostat: str) -> bool:
-        """Whether a heliostat has carried out the order."""
+        """Whether a heliostat has carried out the order, as far as is known."""
         return heliostat in self._done or heliostat in self._proof.done
 
     def take_back(
         self, names: tuple[str, ...], rows: npt.NDArray[Any], heard: npt.NDArray[np.float64]
     ) -> tuple[str, ...]:
-        """Return which of K heliostats carried out the order but have moved back since.
+        """Return which of K heliostats carried out the order but have since moved back.
 
-        They no longer count as done. A record (`NODE`) from before the order is ignored.
+        These heliostats no longer count as done. A record (`NODE`) from before the order is
+        ignored.
         """
         done = self.proof.done
         out = np.isin(rows["state"], states.BEAM_OUT)
@@ -137,14 +138,14 @@ class EmergencyOrder:
         mismatched: Mask,
         shining: Mask,
     ) -> None:
-        """Accept the state of heliostats (K,): `NODE` records, their time of validity, and drives.
+        """Accept `NODE` records of heliostats (K,), their times of validity, and the drives.
 
         Step counts (``counted``) from before the order are ignored, because they do not show where
         the beam is now.
 
         ``mismatched`` heliostats do not match their address: their counts may belong to another
-        heliostat, so nothing that they report counts as proof. As long as a beam is still on a
-        receiver (``shining``), the heliostat is not done.
+        heliostat, so their reports prove nothing. As long as a beam is still on a receiver
+        (``shining``), the heliostat is not done.
         """
         settled = heard >= self.at + LEAVING
         stowed = carried_out(Act.STOW, rows, drives, settled)
@@ -158,12 +159,12 @@ class EmergencyOrder:
 
 
 def switched_off(flags: npt.NDArray[Any]) -> Mask:
-    """Return a mask of heliostats away from stow whose local switch is off, so cannot obey."""
+    """Return a mask of the heliostats that cannot obey: away from stow, local switch off."""
     return np.asarray((flags & meanings.LOCAL_SWITCH != 0) & (flags & meanings.AT_STOW == 0))
 
 
 def at_stow(rows: npt.NDArray[Any]) -> Mask:
-    """Return a mask of the rows (K,) of `NODE` whose heliostat is at rest at stow.
+    """Return a mask of the `NODE` records (K,) that show a heliostat at rest at stow.
 
     A heliostat that is locked there or has a fault counts; a heliostat that is IDLE there does not,
     because it may start to track.
@@ -173,7 +174,7 @@ def at_stow(rows: npt.NDArray[Any]) -> Mask:
 
 
 def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) -> Mask:
-    """Return a mask of the rows (K,) of `NODE` that show DEFOCUS or STOW carried out.
+    """Return a mask of the `NODE` records (K,) that show DEFOCUS or STOW carried out.
 
     Parameters
     ----------

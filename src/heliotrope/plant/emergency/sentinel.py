@@ -1,8 +1,7 @@
 """The plant's own safety actions: evaluate the table, order, repeat, confirm.
 
 A field-wide emergency begins when the table requires DEFOCUS or STOW of the field, or when a person
-orders it. It ends when nothing requires it any longer, that is, when the causes have gone and are
-acknowledged, and all orders are withdrawn.
+orders it. It ends when the causes have gone and are acknowledged, and all orders are withdrawn.
 """
 
 import contextlib
@@ -54,7 +53,7 @@ _NIGHT = ("the sun is down", "plant")
 
 
 class Sentinel(Part):
-    """Acts on the safety table, and follows every emergency until its proof is complete.
+    """Acts on the safety table, and follows every emergency until all heliostats have obeyed.
 
     Parameters
     ----------
@@ -78,11 +77,11 @@ class Sentinel(Part):
     table
         As given.
     order
-        The last field-wide order, None before the first.
+        The last field-wide order; None before the first.
     on
         Whether a field-wide emergency is active.
     night
-        Why the field rests at stow although nothing is wrong, "" by day.
+        Why the field rests at stow although nothing is wrong; "" by day.
     """
 
     def __init__(
@@ -159,7 +158,7 @@ class Sentinel(Part):
             self._joining.drop(self.table.reasons(Act.HOLD))
 
     def _obey_night(self) -> None:
-        """Send the field to stow at sunset, heliostats in turn, as an ordinary STOW."""
+        """Send the field to stow at sunset, one heliostat after the other, by an ordinary STOW."""
         before, self.night = self.night, self.table.night()
         if self.night and not before:
             self._joining.drop(self.night)
@@ -182,10 +181,11 @@ class Sentinel(Part):
                 self._watch.proofs.ledger.follows_loss(members)
 
     def _obey_heliostats(self, now: float) -> None:
-        """Order heliostats off, and repeat the order until their rows release.
+        """Order heliostats off, and repeat the order until no row of the table requires it.
 
-        A heliostat that has just been ordered off has time to report it, unless DEFOCUS has already
-        turned it; in that case its beam stays where it may not be until it is stowed.
+        A heliostat that has just been ordered off is given time to report that it obeys. There is
+        no such wait if DEFOCUS has already turned it away: its beam then stays where it may not be
+        until the heliostat is stowed.
         """
         ordered_off = {**self.table.off(), **self._identities.off(now)}
         self._tries = {name: tried for name, tried in self._tries.items() if name in ordered_off}
@@ -209,7 +209,7 @@ class Sentinel(Part):
     # -- orders ----------------------------------------------------------------------------
 
     def _begin_again(self, act: Act) -> None:
-        """Order the act that the table demands, or continue the previous program's emergency."""
+        """Order the action that the table requires, or continue an earlier program's emergency."""
         before, self._recalled = self._recalled, Standing()
         if before.act:
             self._begin(max(act, Act[before.act]), _AGAIN, before.continued, before.giver)
@@ -221,7 +221,7 @@ class Sentinel(Part):
     ) -> EmergencyOrder:
         """Order DEFOCUS or STOW of the whole field; ``giver`` is a name and a role for the record.
 
-        ``who`` gave the order that this order continues, if it continues one.
+        If this order continues an earlier order, ``who`` gave the earlier order.
         """
         now, names = self._clock.monotonic(), self._field.names
         ticket = self._orders.accept((*giver, act.name), (), names, reason, late=True)
@@ -236,7 +236,7 @@ class Sentinel(Part):
 
     @property
     def _proving(self) -> EmergencyOrder | None:
-        """The order that reports now confirm: the last one, or that of the previous program."""
+        """The order that reports now confirm: the last order, or the previous program's order."""
         return self.order or self._before
 
     @property
@@ -245,9 +245,9 @@ class Sentinel(Part):
         return self._callers.calls
 
     def causes(self) -> dict[str, str]:
-        """Return the reasons for the emergency, by person with an active order and safety table.
+        """Return the reasons for the emergency, by person with an active order, and by table row.
 
-        It is empty if no emergency is active.
+        The result is empty if no emergency is active.
         """
         causes = {call.who: call.reason for call in self.calls}
         withdrawn = "" if causes else self.table.withdrawn()
@@ -257,7 +257,7 @@ class Sentinel(Part):
         return causes
 
     def ends_by(self, condition: str) -> bool:
-        """Return whether only one row of the table, whose cause has gone, still requires it."""
+        """Return whether only one table row, whose cause has gone, keeps the emergency active."""
         return self.on and not self.calls and not self.table.caused(but=condition)
 
     def call(self, who: str, act: Act, reason: str, at: float) -> EmergencyOrder:
@@ -295,7 +295,7 @@ class Sentinel(Part):
 
         Returns
         -------
-        What the operator should know about it, see `Callers.withdraw`.
+        What the operator should know about the withdrawal; see `Callers.withdraw`.
         """
         now = self._clock.monotonic()
         told = self._callers.withdraw(who, by, now)
@@ -303,7 +303,10 @@ class Sentinel(Part):
         return told
 
     def _keep(self, now: float) -> None:
-        """Store the emergency for the next program; a proof in progress, only at intervals."""
+        """Store the emergency for the next program.
+
+        While only the set of unconfirmed heliostats changes, it is stored at intervals.
+        """
         if self._record is None or (self._recalled.act and not self.on):
             return
         standing = self._standing()
@@ -322,7 +325,7 @@ class Sentinel(Part):
     def acknowledge(
         self, condition: str, who: str, role: AcknowledgeRole, subject: str
     ) -> str | None:
-        """Acknowledge a row of the table; return why it is refused, None if accepted."""
+        """Acknowledge a row of the table; return why this is refused, or None if it is accepted."""
         refusal = self.table.acknowledge(condition, who, role, subject)
         if not refusal and condition == UNPROVEN:
             self._unproven.pop(subject, None)
@@ -349,7 +352,7 @@ class Sentinel(Part):
     ) -> Ticket:
         """Send DEFOCUS or STOW to some heliostats; ``giver`` is a name and a role.
 
-        An ordinary STOW of a large number goes ``in_turn``, but at once while an emergency is
+        An ordinary STOW of many heliostats goes ``in_turn``, but at once while an emergency is
         active.
         """
         # Short of an emergency, the table orders off heliostats with a problem.
@@ -411,7 +414,7 @@ class Sentinel(Part):
         order.take_stage(heliostats, stage, now)
 
     def on_rows(self, cluster: str, now: float) -> None:
-        """Update the proof of the order from a cluster's new status."""
+        """Update, from a cluster's new status, how far the order has been carried out."""
         order, names = self._proving, self._field.members[cluster]
         if not self.on:
             names = tuple(name for name in names if name in self._unproven)
@@ -459,12 +462,12 @@ class Sentinel(Part):
                 self._unproven[name] = min(self._unproven[name], now)
 
     def _doubted(self, heliostat: str) -> str | None:
-        """Return the reason why a heliostat's reports do not reveal its beam, None if they do."""
+        """Return why a heliostat's reports do not reveal where its beam is; None if they do."""
         untrusted = self._identities.untrusted(heliostat)
         return untrusted or self._drive_checks.stalled.get(heliostat)
 
     def _order_again(self, order: EmergencyOrder, names: tuple[str, ...]) -> None:
-        """Order heliostats off again that have come back while the emergency is active."""
+        """Order off again the heliostats that have come back while the emergency is active."""
         index = np.array([self._field.index[name] for name in names], dtype=np.intp)
         back = order.take_back(names, self._field.rows[index], self._field.heard[index])
         if back:
@@ -489,7 +492,7 @@ class Sentinel(Part):
         return text + f"{now - field.posed_at[row]:.0f} s ago it was {states.STATES[state]}{beam}"
 
     def refusal(self, clusters: Iterable[str]) -> str | None:
-        """Return the reason that forbids new motion in some clusters, None if it is allowed."""
+        """Return the reason that forbids new motion in some clusters; None if motion is allowed."""
         if self.on and self.order is not None:
             return f"an emergency is active ({self.order.act.name}; {_said(self.causes())})"
         texts = (self.table.reasons(Act.REFUSE_NEW, name) for name in sorted(set(clusters)))
@@ -502,7 +505,7 @@ def _said(causes: Mapping[str, str]) -> str:
 
 
 def _left_order(before: Standing, unproven: tuple[str, ...], clock: Clock) -> EmergencyOrder | None:
-    """Return the order that heliostats have yet to confirm after a restart, None if none."""
+    """Return the order that heliostats have yet to confirm after a restart; None if none."""
     if not unproven:
         return None
     ticket = Ticket("", before.left_by, unproven, clock, math.inf)
@@ -513,7 +516,7 @@ def _left_order(before: Standing, unproven: tuple[str, ...], clock: Clock) -> Em
 
 
 def _recall(record: EmergencyRecord) -> Standing:
-    """Return the emergency that was active when the last program ended."""
+    """Return the emergency that was active when the previous program ended."""
     try:
         document = record.emergency()
     except StoreError as error:

@@ -1,4 +1,4 @@
-"""The active emergency, as the store preserves it across a restart of the plant program."""
+"""The record of the active emergency that the store preserves across a restart of the plant."""
 
 import json
 from collections.abc import Sequence
@@ -16,11 +16,11 @@ class EmergencyRecord(Protocol):
     """A store for one document about the active emergency."""
 
     def emergency(self) -> str:
-        """Return the document; empty if there is none."""
+        """Return the document; an empty document if none is stored."""
         ...
 
     def keep_emergency(self, document: str) -> None:
-        """Replace the document; an empty one means that no emergency is active.
+        """Replace the document; an empty document means that no emergency is active.
 
         Raises
         ------
@@ -41,7 +41,7 @@ class Call:
     act
         "DEFOCUS" or "STOW".
     at
-        POSIX s.
+        When the order was given, POSIX s.
     """
 
     who: str
@@ -51,7 +51,7 @@ class Call:
 
     @property
     def text(self) -> str:
-        """One line: person, action, time, reason."""
+        """The order in one line: person, action, time, reason."""
         since = f"{datetime.fromtimestamp(self.at, UTC):%H:%M} UTC"
         return f"{self.who} ({self.act}, {since}: {self.reason})"
 
@@ -70,7 +70,7 @@ class Standing:
         The orders that have not been withdrawn, one per person.
     rows
         Rows of the safety table that keep beams off or wait for acknowledgement, each with its
-        cluster or heliostat, "" for the field.
+        cluster or heliostat ("" for the field).
     unproven
         Heliostats not confirmed to have carried out the order.
     left_by
@@ -87,17 +87,17 @@ class Standing:
 
     @property
     def document(self) -> str:
-        """The document for the store, empty if there is nothing to store."""
+        """The document for the store; an empty document if there is nothing to store."""
         return "" if self == Standing() else json.dumps(asdict(self))
 
     @property
     def giver(self) -> str:
-        """The persons whose orders are active; if none, whoever gave the field-wide order."""
+        """The persons whose orders are active, or else whoever gave the field-wide order."""
         return ", ".join(call.who for call in self.calls) or self.who
 
     @property
     def continued(self) -> str:
-        """The reason, in words, of the order that continues this emergency."""
+        """The reason, in words, to record for the order that continues this emergency."""
         reason = "; ".join(call.reason for call in self.calls) or self.reason
         text = f"{reason}; it was active when the plant's program ended"
         if not self.unproven:
@@ -107,7 +107,10 @@ class Standing:
 
 
 def read_standing(document: str) -> Standing:
-    """Return the contents of a document; if unreadable, a user's DEFOCUS, the safe choice."""
+    """Return the contents of a document.
+
+    If it is unreadable, a DEFOCUS ordered by a user is returned, because that is the safe choice.
+    """
     if not document:
         return Standing()
     try:

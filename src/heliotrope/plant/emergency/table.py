@@ -1,4 +1,4 @@
-"""The plant's part of the safety table: readings in, required actions and alarms out."""
+"""The plant's part of the safety table: it turns readings into required actions and alarms."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -104,15 +104,15 @@ class PlantReadings:
     def take(
         self, proof: Proof | None, unproven: Mapping[str, float], *, called: bool, now: float
     ) -> dict[tuple[str, str], Reading]:
-        """Return the readings now.
+        """Return the present readings.
 
         Parameters
         ----------
         proof
             Proof of the emergency order in force; None if there is none.
         unproven
-            Time since which each heliostat that an emergency left unconfirmed has been confirmed,
-            monotonic s; infinite if it has not.
+            For each heliostat that an emergency left unconfirmed, the time since which it has been
+            confirmed, monotonic s; infinite if it has not been confirmed.
         called
             Whether a person has ordered an emergency that is not withdrawn.
         now
@@ -140,7 +140,7 @@ class PlantReadings:
 
 
 class TableWatch:
-    """Evaluation of the safety-table rows for which the plant is responsible.
+    """Evaluates the safety-table rows for which the plant is responsible.
 
     Parameters
     ----------
@@ -224,7 +224,7 @@ class TableWatch:
     def shown(self, now: float) -> dict[str, float]:
         """Return the newest sensor readings, by name, in the units of the rows.
 
-        NaN: there is no reading, or it is too old.
+        A value is NaN if there is no reading, or if it is too old.
         """
         return {
             name: reading.value
@@ -268,7 +268,7 @@ class TableWatch:
         return news
 
     def recall(self, rows: Iterable[tuple[str, str]]) -> None:
-        """Restore rows as tripped before a restart, each with its subject."""
+        """Restore the rows that were tripped before a restart, each with its subject."""
         self._state = recalled(self._state, rows)
 
     def standing(self) -> tuple[tuple[str, str], ...]:
@@ -287,7 +287,7 @@ class TableWatch:
     def acknowledge(
         self, condition: str, who: str, role: AcknowledgeRole, subject: str
     ) -> str | None:
-        """Acknowledge a row; return why it is refused, None if accepted."""
+        """Acknowledge a row; return why this is refused, or None if it is accepted."""
         self._state, refusal = acknowledge(self._state, condition, who, role, subject)
         if not refusal:
             key = (condition, subject)
@@ -295,11 +295,11 @@ class TableWatch:
         return refusal
 
     def demanded(self, cluster: str = "") -> Act | None:
-        """Return the strongest action required of the field, or of one cluster alone."""
+        """Return the strongest action required of the field, or of one cluster if it is named."""
         return max((a.act for a in self._demands(cluster)), default=None)
 
     def _demands(self, cluster: str = "") -> Iterator[Action]:
-        """Yield the actions for the field, or for one cluster alone, except those of the night."""
+        """Yield the actions for the field, or for one cluster, except actions for the night."""
         scope = Scope.CLUSTER if cluster else Scope.FIELD
         return (
             a
@@ -308,11 +308,11 @@ class TableWatch:
         )
 
     def night(self) -> str | None:
-        """Return the reason for resting at stow although nothing is wrong, None by day."""
+        """Return why the field rests at stow although nothing is wrong; None by day."""
         return next((a.text for a in self.actions if a.condition == NIGHT), None)
 
     def off(self) -> dict[str, tuple[Act, str]]:
-        """Return the heliostats that must leave, by name, each with its action and the reason."""
+        """Return the heliostats that must leave, by name, each with the action and the reason."""
         return {
             a.subject: (a.act, a.text)
             for a in reversed(self.actions)
@@ -320,7 +320,7 @@ class TableWatch:
         }
 
     def blocked(self, condition: str = "") -> dict[str, str]:
-        """Return the heliostats that one row, or any, keeps from their aims, and the reasons."""
+        """Return the heliostats that one row, or any row, keeps from their aims, and why."""
         return {
             a.subject: a.text
             for a in self.actions
@@ -347,9 +347,11 @@ class TableWatch:
         return "; ".join([a.text for a in demands if a.act >= least and a.condition != but][:3])
 
     def withdrawn(self) -> str:
-        """Return how an emergency ordered by operators ends, empty if there is none.
+        """Return how an emergency ends whose orders have all been withdrawn.
 
-        For an emergency whose orders have all been withdrawn.
+        Returns "" if there is no such emergency.
+
+        This concerns emergencies that operators ordered.
         """
         row = next((row for row in self._state.table if row.name == ORDERED), None)
         if row is None or row.role is None or all(a.condition != ORDERED for a in self._demands()):

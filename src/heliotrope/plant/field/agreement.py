@@ -4,10 +4,10 @@ A cluster with a wrong clock or site sends its local controllers a wrong sun vec
 heliostat then tracks without any fault indication, but misses its aim or standby point. The plant
 therefore compares the time and the site in each status with its own. From the step counts of each
 heliostat, the sun vector and the parameters that it knows, it also computes where the beam goes,
-and compares that with the point to which the beam was sent.
+and compares this direction with that of the point to which the beam was sent.
 
 A beam is directed to a point in three states: TRACKING, SEARCHING (within the radius that the plant
-ordered), and IDLE, unless the heliostat holds still there. It holds still after UNLOCK and
+ordered), and IDLE, unless the heliostat stands still in IDLE. It stands still after UNLOCK and
 CLEAR_FAULT, where an operator moved it, and until it has reached standby along the path from stow.
 In every other state it is defocused, moving, locked, or at stow by the counts that it stores
 itself, and there is no point to compare.
@@ -68,9 +68,9 @@ class _Points:
     Attributes
     ----------
     before
-        The points before the assigned ones, latest first, (`assigned.BEFORE`, N, 3); NaN from the
-        point at which the beam was found. They are kept because a local controller may refuse an
-        assigned point, and then the beam stays at an earlier one.
+        The points before the assigned ones, latest first, (`assigned.BEFORE`, N, 3). All are NaN
+        once the beam was found at the assigned point. They are kept because a local controller may
+        refuse an assigned point, and then the beam stays at an earlier one.
     """
 
     def __init__(self, points: FloatArray, before: FloatArray) -> None:
@@ -86,7 +86,10 @@ class _Points:
         return changed
 
     def beside(self, rows: Rows, beam: FloatArray, vertex: FloatArray) -> FloatArray:
-        """Return the angle between beams (K, 3) and the nearest point of each, rad, (K,)."""
+        """Return the angle between each beam and its nearest point, rad, (K,).
+
+        The beams are vectors, (K, 3). The nearest point is the assigned point or an earlier one.
+        """
         error = _angle(beam, self.points[rows] - vertex)
         self.before[:, rows[error < NOTED]] = np.nan
         for points in self.before[:, rows]:
@@ -109,8 +112,8 @@ class Agreement(Part):
     utc
         Function that returns the plant's time, POSIX s.
     differing
-        Function that returns why a heliostat does not store the desired parameters, None if it
-        does.
+        Function that returns why a heliostat does not store the desired parameters; None if it
+        stores them.
     """
 
     def __init__(
@@ -159,7 +162,7 @@ class Agreement(Part):
         now: float,
         again: bool,
     ) -> None:
-        """Record how far a command that was sent may move beams from their points."""
+        """Record how far a sent command may move beams from their points."""
         del now, again
         if name == "SEARCH":
             rows = np.array([self._field.index[name] for name in heliostats], dtype=np.intp)
@@ -177,7 +180,9 @@ class Agreement(Part):
             self._sun_off[cluster] = _sun_off(status.site, self._site, utc_s)
 
     def readings(self, now: float) -> dict[tuple[str, str], Reading]:
-        """Return the differences of clusters and of heliostats; all those not listed agree.
+        """Return the differences found for clusters and for heliostats.
+
+        Clusters and heliostats that are not listed agree.
 
         A cluster that has fallen silent keeps its last difference, because a separate row covers
         silence.
@@ -241,7 +246,10 @@ class Agreement(Part):
         return np.asarray(begins | ~(on_aim | at_rest))
 
     def _errors(self, rows: Rows, sent: _Points, now: float) -> FloatArray:
-        """Return the angle between each beam (K,) and its point, rad, from goals and counts."""
+        """Return the angle between each beam and its point, rad, (K,).
+
+        The angle is computed from the step goals and the step counts.
+        """
         field = self._field
         sun = self._sun_at(now - field.counted_at[rows])
         drives = Drive(self._drives[rows])
@@ -262,14 +270,17 @@ class Agreement(Part):
         return error
 
     def _sun_at(self, ages: FloatArray) -> FloatArray:
-        """Return the sun vectors some time ago, (K, 3); ages (K,) in s."""
+        """Return the sun vectors at times in the past, (K, 3), for ages (K,) in s."""
         utc_s = self._utc()
         sun = fast_vector(utc_s, self._site)
         rate = (sun - fast_vector(utc_s - _SPAN, self._site)) / _SPAN
         return normalize(sun - rate * ages[:, None], "sun")
 
     def _beside(self, rows: Rows, sent: _Points, angles: FloatArray, sun: FloatArray) -> FloatArray:
-        """Return the angle between beams (K,), axes at angles (K, 2), and their points, rad."""
+        """Return the angle between each beam and its point, rad, (K,).
+
+        The axes are at angles (K, 2).
+        """
         normal, vertex = Armature(self._armature[rows]).pose(angles)
         beam = 2.0 * np.sum(sun * normal, axis=-1, keepdims=True) * normal - sun
         return sent.beside(rows, beam, vertex)
@@ -282,7 +293,7 @@ def _angle(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _sun_off(values: Sequence[float], site: Site, utc_s: float) -> float:
-    """Return the angle between the sun vectors of a reported site and of the plant's, rad."""
+    """Return the angle between the sun vectors at a reported site and at the plant's site, rad."""
     if tuple(values) == site.numbers:
         return 0.0
     try:

@@ -67,7 +67,7 @@ def spread(vertices: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
 def default_aims(
     design: Plant, names: Sequence[str], vertices: FloatArray, points: npt.ArrayLike | None
 ) -> dict[str, FloatArray]:
-    """Return an aim per heliostat: given points spread over them, or the design's aims.
+    """Return one aim per heliostat: the given points, spread over the field, or the design's aims.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def default_aims(
     names, vertices
         Heliostats and their positions, ENU, m, (N, 3).
     points
-        Aim points, (P, 3); None: those of the design.
+        Aim points, (P, 3); None: the aims of the design.
 
     Raises
     ------
@@ -109,9 +109,10 @@ class BeamCheck:
     names
         The N heliostats, in the order of all arrays here.
     volumes
-        Keep-out volumes; None: those of the design.
+        Keep-out volumes; None: the volumes in the design.
     eyes
-        Points from which people may see resting beams, ENU, m, (P, 3); None: those of the design.
+        Points from which people may see resting beams, ENU, m, (P, 3); None: the points in the
+        design.
 
     Attributes
     ----------
@@ -163,7 +164,7 @@ class BeamCheck:
         self.mirrors = MirrorOptics.of(*sizes)
 
     def replace(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
-        """Use a heliostat's new calibration: arrays (18,) and (2, 19)."""
+        """Use a heliostat's new calibration: its armature, (18,), and its drives, (2, 19)."""
         self.armature.table[row] = armature
         self.drives.table[row] = drives
         self._stop(row)
@@ -171,8 +172,7 @@ class BeamCheck:
     def _stop(self, row: int) -> None:
         """Use the drive limits as stops, as the local controller does for its pose.
 
-        Without stops, the pose nearest to the present one may differ from the pose that the
-        heliostat takes.
+        Without stops, the computed pose may differ from the pose that the heliostat takes.
         """
         machine, table = self.machines.get(self.names[row]), self.drives.table[row]
         for i, axis in enumerate(() if machine is None else machine.axes):
@@ -186,7 +186,9 @@ class BeamCheck:
         sun: FloatArray,
         counts: FloatArray | None = None,
     ) -> Tracking:
-        """Return the poses for aims (K, 3) of heliostats (K,) that are nearest to counts (K, 2).
+        """Return the poses that direct heliostats (K,) at aims (K, 3).
+
+        Of the possible poses, the one nearest to the step counts (K, 2) is returned.
 
         The sun vector is (3,) or (K, 3).
         """
@@ -201,9 +203,10 @@ class BeamCheck:
         )
 
     def stop(self, row: int, aim: FloatArray, sun: FloatArray, counts: FloatArray) -> str:
-        """Return the stop that prevents a heliostat from aiming at a point (3,), and the remedy.
+        """Return in words which stop keeps a heliostat from aiming at a point (3,), and the remedy.
 
-        The sun vector is (3,), and the pose is the one nearest to counts (2,).
+        The sun vector is (3,). Of the poses for the point, the one nearest to the counts (2,) is
+        examined.
         """
         table = self.drives.table[row]
         free = table.copy()
@@ -244,7 +247,7 @@ class BeamCheck:
         sun
             Sun vector, (3,).
         start
-            Points at which their beams are now, ENU, m, (K, 3), NaN if there is none. The sweep
+            Points at which their beams are now, ENU, m, (K, 3); NaN if there is none. The sweep
             from there is checked as well.
         stopped
             Whether a surface at the aim (receiver, target) stops the beam. A beam at a standby
@@ -391,7 +394,7 @@ class BeamCheck:
         sun: FloatArray,
         when: str = _ON_ITS_WAY,
     ) -> dict[str, str]:
-        """Return the heliostats whose beams would enter a volume on a path of their axes, and why.
+        """Return the heliostats whose beams would enter a volume on a path, and the reasons.
 
         Parameters
         ----------
@@ -412,7 +415,7 @@ class BeamCheck:
     def crossing(
         self, rows: npt.NDArray[np.intp], path: FloatArray, sun: FloatArray, when: str
     ) -> dict[str, str]:
-        """Return the heliostats whose beams would cross a receiver on a path, and why.
+        """Return the heliostats whose beams would cross a receiver on a path, and the reasons.
 
         For the arguments see `moving`. The check uses the core of a beam; see `_MIDDLE`.
         """
@@ -426,7 +429,7 @@ class BeamCheck:
     def lights(
         self, rows: npt.NDArray[np.intp], angles: FloatArray, sun: FloatArray
     ) -> npt.NDArray[np.bool_]:
-        """Return a mask of the beams on a receiver, (K,), with the axes at angles (K, 2).
+        """Return a mask of the beams that hit a receiver with the axes at angles (K, 2), (K,).
 
         For ``sun`` see `problems`; the check uses the core of a beam.
         """
@@ -436,7 +439,10 @@ class BeamCheck:
     def _on_receivers(
         self, rows: npt.NDArray[np.intp], path: FloatArray, sun: FloatArray
     ) -> npt.NDArray[np.bool_]:
-        """Return masks of the beams whose cores cross R receivers on a path, (K, R)."""
+        """Return a mask of which beams cross which of the R receivers on a path, (K, R).
+
+        The check uses the cores of the beams.
+        """
         if not (len(rows) and self.solids and sun[..., 2].max() > 0.0):
             return np.zeros((len(rows), len(self.solids)), dtype=np.bool_)
         armature = Armature(self.armature.table[rows])
@@ -448,7 +454,7 @@ class BeamCheck:
         counts: FloatArray,
         tables: tuple[FloatArray, FloatArray] | None = None,
     ) -> dict[str, str]:
-        """Return the heliostats whose resting beams come too close to something in a year, and why.
+        """Return the heliostats whose resting beams come too close to an object in a year, and why.
 
         The check covers receivers, targets and keep-out volumes, with the heliostats at rest at
         counts (K, 2) and the sun at any position of the year. See also `Machine.stow_lights`.
@@ -458,7 +464,8 @@ class BeamCheck:
         rows, counts
             Indices of the heliostats, (K,), and steps, (K, 2).
         tables
-            Armatures and drives, (K, 18) and (K, 2, 19); None: those of this check.
+            Armatures and drives, (K, 18) and (K, 2, 19); None: the armatures and drives of this
+            check.
         """
         armature, drives = tables or (self.armature.table[rows], self.drives.table[rows])
         normal, vertex = Armature(armature).pose(Drive(drives).angles(counts))
@@ -497,7 +504,9 @@ class BeamCheck:
         return standing_beams(vertex, normal, sun, mirrors, FAR)
 
     def inside(self, row: int, poses: FloatArray, sun: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return the poses, axis angles (K, 2), in which the beam of a heliostat is in a volume.
+        """Return a mask of the poses in which the beam of a heliostat is in a volume.
+
+        A pose is the angles of both axes; the poses are (K, 2).
 
         For ``sun`` see `problems`.
         """
@@ -559,7 +568,7 @@ def _rows_of(mirrors: MirrorOptics, rows: npt.NDArray[np.intp] | list[int]) -> M
 
 
 def _disc(eye: FloatArray, aim: FloatArray, radius: float, apart: float) -> FloatArray:
-    """Return points (P, 3) of the disc at the aim that a cone of half angle ``radius`` covers."""
+    """Return points (P, 3) on the disc at the aim that a cone of half angle ``radius`` covers."""
     ray = aim - eye
     distance = float(np.linalg.norm(ray))
     right = np.cross(ray, (0.0, 0.0, 1.0)) if ray[:2].any() else np.array([1.0, 0.0, 0.0])

@@ -10,8 +10,8 @@ name and renamed, so that either the old or the new file always exists.
 A local controller may refuse a point, or never receive it. The previous points are therefore kept
 until the new point is acknowledged, so that a restarted program knows where a beam may still be.
 
-What visits hold (`HELD`) is stored with the points, also on disk before it is taken; a restarted
-program releases it (`giving_back`).
+What visits hold (`HELD`), such as locks, is stored with the points, also before a visit takes it; a
+restarted program releases it (`giving_back`).
 """
 
 import json
@@ -60,7 +60,7 @@ class Assigned(Protocol):
     """A store of assigned points."""
 
     def read(self) -> dict[str, Places]:
-        """Return the stored points, by kind; empty if there are none."""
+        """Return the stored points, by kind; an empty mapping if there are none."""
         ...
 
     def keep(self, points: Mapping[str, Places]) -> None:
@@ -156,15 +156,15 @@ class Points:
     names
         Names of the heliostats.
     store
-        Store of the points; None: they do not outlive the plant.
+        Store of the points; None: the points are lost when the plant's program ends.
 
     Attributes
     ----------
     aims, standbys
-        ENU, m, (N, 3); NaN if there is none.
+        Assigned points, ENU, m, (N, 3); NaN if there is none.
     earlier
         By kind, the earlier points that a local controller may still have, latest first, (`BEFORE`,
-        N, 3); NaN if there is none, because the assigned point was acknowledged.
+        N, 3); NaN once the assigned point was acknowledged.
     held
         What visits held when the last program ended, by kind (`HELD`) and heliostat.
     """
@@ -197,7 +197,7 @@ class Points:
         self.held = {kind: dict(self._stored[kind]) for kind in HELD}
 
     def assign(self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray) -> None:
-        """Assign points (K, 3) to heliostats (K,), which must also be stored (`storing`)."""
+        """Assign points (K, 3) to heliostats (K,). The points must also be stored (`storing`)."""
         known = self._arrays[kind]
         changed = np.asarray(rows)[differ(known[rows], points)]
         put_before(self.earlier[kind], changed, known[changed])
@@ -212,10 +212,10 @@ class Points:
             self._taken[kind][name] = tuple(place), marks.get(name)
 
     def unknown(self, kind: str, rows: slice = slice(None)) -> npt.NDArray[np.bool_]:
-        """Return a mask of the local controllers, all (N,) or some (K,), that may have any point.
+        """Return a mask of the local controllers whose point is unknown, for all (N,) or some (K,).
 
-        The assigned point was not acknowledged, and no earlier one is known, because it was the
-        first or the store is a restored backup.
+        Such a controller has not acknowledged its assigned point, and no earlier point is known,
+        because the assigned point was the first or the store is a restored backup.
         """
         return np.asarray((self.earlier[kind][0, rows] == self._arrays[kind][rows]).all(axis=-1))
 
@@ -235,11 +235,11 @@ class Points:
     def storing(
         self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray, held: Held = NOTHING
     ) -> tuple[Work, Callable[..., None]]:
-        """Return disk work that stores points (K, 3) of heliostats (K,), and work that reverts it.
+        """Return disk work that stores points (K, 3) of heliostats (K,), and its reversal.
 
-        ``held`` is stored in the same write; see `holding`. Both raise `AssignedError` if storing
-        fails. The second leaves alone points that have been replaced in the meantime. It may be
-        repeated, and accepts the heliostats to revert, by default all of them.
+        ``held`` is stored in the same write; see `holding`. Both pieces of work raise
+        `AssignedError` if storing fails. The reversal does not touch points that have since been
+        replaced. It may be repeated, and accepts the heliostats to revert, by default all of them.
         """
         new = {self._names[i]: tuple(p) for i, p in zip(rows, points.tolist(), strict=True)}
         present = self._arrays[kind][rows]
@@ -269,9 +269,11 @@ class Points:
         return store, take_back
 
     def settling(self) -> Work | None:
-        """Return disk work that deletes the points before acknowledged ones, if there are any.
+        """Return disk work that deletes the predecessors of acknowledged points.
 
-        It raises `AssignedError` if that cannot be stored, and may be repeated.
+        Returns None if there are none.
+
+        The work raises `AssignedError` if the change cannot be stored, and may be repeated.
         """
         if not any(self._taken.values()):
             return None
@@ -296,8 +298,8 @@ class Points:
     def holding(self, held: Held) -> tuple[Work, Work]:
         """Return disk work that stores what visits hold, and disk work that reverts it.
 
-        None means that a visit no longer holds it. Only differences are written. Both raise
-        `AssignedError` if storing fails.
+        A value of None means that no visit holds anything there any longer. Only differences are
+        written. Both pieces of work raise `AssignedError` if storing fails.
         """
         old: dict[str, dict[str, tuple[float, ...] | None]] = {}
 
@@ -315,10 +317,12 @@ class Points:
         return store, take_back
 
     def released(self, held: Mapping[str, Collection[str]], now: float) -> Work | None:
-        """Return disk work that deletes records of what visits no longer hold, if there are any.
+        """Return disk work that deletes records of what visits no longer hold.
 
-        ``held`` names the heliostats of which visits hold something, by kind; ``now`` is monotonic
-        s.
+        Returns None if there are none.
+
+        ``held`` contains, by kind, the heliostats of which visits hold something; ``now`` is
+        monotonic, s.
         """
         free = {(k, n) for k, names in held.items() for n in self._stored[k].keys() - set(names)}
         self._idle = {key: self._idle.get(key, now) for key in free}
@@ -341,15 +345,15 @@ class Points:
 
 
 def differ(a: FloatArray, b: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return a mask of the points (K, 3) that differ, (K,); NaN equals NaN."""
+    """Return a mask of where two sets of points (K, 3) differ, (K,); NaN equals NaN."""
     return np.asarray(~np.all((a == b) | (np.isnan(a) & np.isnan(b)), axis=-1))
 
 
 def put_before(earlier: FloatArray, rows: npt.NDArray[np.intp], points: FloatArray) -> None:
     """Put points (K, 3) of heliostats (K,) before all earlier ones (`BEFORE`, N, 3).
 
-    The oldest point stays, because it is the one that was acknowledged; if there is no room, the
-    point after it is dropped.
+    The oldest point is kept, because it is the acknowledged one; if there is no room, the next
+    oldest is dropped.
     """
     oldest = earlier[-1, rows]
     full = np.isfinite(oldest).all(axis=-1, keepdims=True)
@@ -361,7 +365,7 @@ def put_before(earlier: FloatArray, rows: npt.NDArray[np.intp], points: FloatArr
 def _followed(
     chain: Sequence[tuple[float, ...] | None], point: tuple[float, ...], before: tuple[float, ...]
 ) -> Sequence[tuple[float, ...] | None]:
-    """Return the points of one heliostat, the assigned one first, with a new one assigned."""
+    """Return the points of one heliostat, with a newly assigned point first."""
     last, *earlier = chain
     if last == point:
         return chain
@@ -373,13 +377,13 @@ def _followed(
 
 
 def rest_on(standbys: FloatArray, point: tuple[float, float, float] | None) -> None:
-    """Set a standby point, ENU, m, for all heliostats without one; their boards store it."""
+    """Set a standby point, ENU, m, for all heliostats that have none; their boards store it."""
     if point is not None:
         standbys[~np.isfinite(standbys).all(axis=-1)] = point
 
 
 def points_of(kind: str, points: Mapping[str, npt.ArrayLike]) -> FloatArray:
-    """Return points by name as an array, ENU, m, (K, 3), in their order.
+    """Return points that are keyed by name as an array, ENU, m, (K, 3), in the same order.
 
     Raises
     ------
@@ -398,7 +402,7 @@ def points_of(kind: str, points: Mapping[str, npt.ArrayLike]) -> FloatArray:
 
 
 def grouped(names: Sequence[str], points: FloatArray) -> dict[tuple[float, ...], list[str]]:
-    """Return the heliostats for each point (K, 3), which share one command."""
+    """Group heliostats by their points (K, 3); heliostats with the same point share one command."""
     groups: dict[tuple[float, ...], list[str]] = {}
     for name, point in zip(names, points, strict=True):
         groups.setdefault(tuple(float(x) for x in point), []).append(name)

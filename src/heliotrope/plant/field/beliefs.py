@@ -35,12 +35,12 @@ class KnownSightings:
     sightings
         The sightings, with heliostat index 0.
     identities
-        Numbers given by the store; 0 for a sighting that is not stored, (M,).
+        Numbers assigned by the store, (M,); 0 for a sighting that is not stored.
     targets
         Name of the target of each sighting, M.
     missed
         Beam error under the mechanism that was believed when the sighting was taken, rad, (M,); NaN
-        if recalled.
+        if the sighting was recalled.
     """
 
     sightings: Sightings
@@ -81,13 +81,16 @@ class Beliefs:
             self._growth |= dict.fromkeys(group.names, default_growth(group.mechanism))
 
     def subscribe(self, subscriber: Subscriber, *, held: bool = True) -> None:
-        """Call a function with each new calibration and, if ``held``, now with the current ones."""
+        """Call a function with each new calibration.
+
+        If ``held``, also call it now with each current calibration.
+        """
         self._subscribers.append(subscriber)
         for record in self._records.values() if held else ():
             subscriber(record)
 
     def subscribe_drift(self, subscriber: Subscriber) -> None:
-        """Call a function with each calibration whose covariance growth changes from now on."""
+        """From now on, call a function with each calibration whose covariance growth changes."""
         self._drifting.append(subscriber)
 
     def number_with(self, numbering: Numbering) -> None:
@@ -104,7 +107,7 @@ class Beliefs:
     def present(self, heliostat: str) -> Mechanism:
         """Return the present believed mechanism, batch shape (1,).
 
-        Before the first calibration it is the mechanism of the plant file, with its parameters.
+        Before the first calibration, this is the mechanism in the plant file, with its parameters.
         """
         record = self._records.get(heliostat)
         if record is not None:
@@ -114,7 +117,7 @@ class Beliefs:
         return self.nominal(heliostat).with_parameters(values)
 
     def record(self, heliostat: str) -> HeliostatCalibration | None:
-        """Return the current calibration; None before the first."""
+        """Return the current calibration of a heliostat; None before its first."""
         return self._records.get(heliostat)
 
     def growth(self, heliostat: str) -> Growth:
@@ -122,15 +125,15 @@ class Beliefs:
         return self._growth[heliostat]
 
     def hyper(self, heliostat: str) -> Hyperparameters | None:
-        """Return the hyperparameters of the heliostat's group; None while the defaults apply."""
+        """Return the hyperparameters of a heliostat's group; None while the defaults apply."""
         return self._hyper.get(heliostat)
 
     def known(self, heliostat: str) -> KnownSightings | None:
-        """Return the known sightings; None if there are none."""
+        """Return the known sightings of a heliostat; None if there are none."""
         return self._known.get(heliostat)
 
     def count(self, heliostat: str) -> int:
-        """Return the number of known sightings of a heliostat, photographed and airborne."""
+        """Return the number of known sightings of a heliostat, from photographs and flights."""
         known = self._known.get(heliostat)
         return (0 if known is None else len(known)) + self.flights.count(heliostat)
 
@@ -144,7 +147,9 @@ class Beliefs:
     # -- taking --------------------------------------------------------------------------------
 
     def note(self, heliostat: str, target: str, new: Sightings) -> KnownSightings:
-        """Add sightings of a heliostat (row 0) on a target; return all known sightings.
+        """Add sightings of a heliostat on a target; return all its known sightings.
+
+        The new sightings have heliostat index 0.
 
         Sightings that the store failed to keep earlier are offered to it again.
         """
@@ -163,9 +168,10 @@ class Beliefs:
         return self._known[heliostat]
 
     def take(self, record: HeliostatCalibration) -> HeliostatCalibration:
-        """Make a calibration the current one, pass it to all subscribers, and return it.
+        """Make a calibration the heliostat's current calibration, and pass it to all subscribers.
 
-        From now on its covariance grows with the drift of its group.
+        From now on the covariance of the calibration grows with the drift of the heliostat's group.
+        The calibration is returned.
         """
         record = record.growing(self.growth(record.heliostat))
         self._records[record.heliostat] = record
@@ -176,8 +182,8 @@ class Beliefs:
     def adopt(self, group: str, hyper: Hyperparameters, source: str) -> None:
         """Put the hyperparameters of a group of the design into force.
 
-        Later fits use them for the drift. The covariances of present calibrations grow by them from
-        now on, but their values stay unchanged until the next visit.
+        Later fits use them for the drift. From now on they determine how the covariances of present
+        calibrations grow; the calibrated values stay unchanged until the next visit.
         """
         growth, names = Growth.of(hyper, source), self.design.groups[group].names
         self._hyper |= dict.fromkeys(names, hyper)
@@ -196,7 +202,7 @@ class Beliefs:
         identities: Identities,
         targets: Sequence[str],
     ) -> None:
-        """Restore a calibration and its sightings from before a restart."""
+        """Restore a calibration, and its sightings, that were stored before a restart."""
         if len(sightings):
             unknown = np.full(len(sightings), np.nan)
             self._known[record.heliostat] = KnownSightings(

@@ -11,7 +11,7 @@ _Key = tuple[str, str]
 
 
 class ClusterAlarms(Part):
-    """Alarms of clusters, each reported once even if repeated, and ended even if its end was lost.
+    """Alarms of clusters, each reported once and ended once, even if messages repeat or are lost.
 
     A message may be lost with its connection, or arrive while the plant's program is suspended. A
     cluster therefore repeats its alarms and lists them; see `ClusterStatus`.

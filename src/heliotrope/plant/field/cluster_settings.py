@@ -17,10 +17,10 @@ EXPECTED = "this plant"
 class ClusterSettings(Part):
     """Compares the clusters' settings with the settings that the plant expects.
 
-    If the plant expects none, the clusters are compared with each other: a cluster is named if its
-    checksum differs from the checksums of more than half of the others; if there are only two and
-    they differ, both are named. A cluster that has fallen silent counts with its last checksum. An
-    older cluster that sends no checksum is not compared.
+    If the plant expects no checksum, the clusters are compared with each other. A cluster is named
+    if its checksum differs from the checksums of more than half of the other clusters; if there are
+    only two clusters and they differ, both are named. A cluster that has fallen silent counts with
+    its last checksum. An older cluster that sends no checksum is not compared.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class ClusterSettings(Part):
             self._known[cluster] = checksum
 
     def _differing(self, cluster: str) -> str | None:
-        """Return the clusters from which a cluster differs, in words; None if it agrees."""
+        """Return in words which clusters a cluster differs from; None if it agrees with them."""
         checksum = self._known.get(cluster, "")
         if self._expected:
             return EXPECTED if checksum not in ("", self._expected) else None

@@ -1,4 +1,4 @@
-"""The plant's ends of the cluster links: messages sent, leases, queries and replies."""
+"""The plant's ends of the links to clusters: messages sent, leases, queries and replies."""
 
 import asyncio
 import math
@@ -34,7 +34,7 @@ class ClusterEnd:
     """The plant's end of the link to one cluster.
 
     A posted message does not wait for a connection. If it cannot be sent now, its outcome says so
-    at once. Urgent messages overtake all other messages not sent yet.
+    at once. Urgent messages are sent before all other waiting messages.
 
     Attributes
     ----------
@@ -60,7 +60,9 @@ class ClusterEnd:
         *,
         urgent: bool = False,
     ) -> None:
-        """Send a message as soon as possible, within ``lifetime`` s (None: at once or never).
+        """Send a message as soon as possible, within ``lifetime`` s.
+
+        If ``lifetime`` is None, the message is sent at once or not at all.
 
         If ``message`` is a function, it creates the message when its turn comes; if it returns
         None, nothing is sent.
@@ -201,7 +203,7 @@ class Clusters:
     async def answer(
         self, cluster: str, what: str, timeout: float, heliostat: str = ""
     ) -> Answer | None:
-        """Query a cluster, and return its reply; None if there is none within ``timeout`` s."""
+        """Query a cluster and return its reply; None if none arrives within ``timeout`` s."""
         future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
 
         def take(answer: Answer) -> None:

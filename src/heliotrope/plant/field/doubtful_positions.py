@@ -3,11 +3,11 @@
 A power failure during motion may leave the step counts of a local controller wrong by up to 1,000
 steps, which it reports as COUNTS_DOUBTFUL until ZERO. Its beam may then be off its aim without any
 other sign. Such a heliostat is named, and kept off the receiver until a photograph on a target or
-an operator has confirmed its position. A confirmation is valid for one boot, because it says
-nothing about the next power failure. Four other groups are kept off in the same way: heliostats
-with new parameters that a calibration has not yet verified, heliostats whose parameters a drone
-flight contradicts, heliostats whose drives stall, and all heliostats while no witness confirms the
-sun.
+an operator has confirmed its position. A confirmation is valid only until the next boot, because
+another power failure may make the counts wrong again. Four other groups are kept off in the same
+way: heliostats with new parameters that a calibration has not yet verified, heliostats whose
+parameters a drone flight contradicts, heliostats whose drives stall, and all heliostats while no
+witness confirms the sun.
 """
 
 import contextlib
@@ -37,8 +37,8 @@ class DoubtfulPositions(Part):
     tell
         Called with each alarm.
     unwitnessed
-        Function that returns the reason why no heliostat may join a receiver, None if heliostats
-        may; see `witnesses`.
+        Function that returns the reason why no heliostat may join a receiver; None if heliostats
+        may join. See `witnesses`.
     stalled
         Heliostats whose drives stall; see `drive_checks`.
 
@@ -105,9 +105,9 @@ class DoubtfulPositions(Part):
         return tuple(name for name in heliostats if self._field.place(name) in self._unverified)
 
     def keep_off(self, heliostats: Iterable[str]) -> None:
-        """Keep heliostats off the receiver that a flight observed far from where they should be.
+        """Keep heliostats off the receiver that a flight observed far from their expected place.
 
-        Heliostats named before, but not now, may join the receiver again.
+        Heliostats named in an earlier call, but not in this one, may join the receiver again.
         """
         self._off_place = frozenset(self._field.place(name) for name in heliostats)
 
@@ -124,7 +124,10 @@ class DoubtfulPositions(Part):
             self._tell(kind.raised(name) if doubtful[i] else kind.ended(name))
 
     def reasons(self, names: Sequence[str], points: FloatArray) -> list[str | None]:
-        """Return the reasons why heliostats may not join the receiver at points (K, 3), or None."""
+        """Return why each heliostat may not join the receiver at its point; None if it may.
+
+        The points are (K, 3).
+        """
         rows = [self._field.place(name) for name in names]
         unverified, off_place = (
             np.isin(rows, list(s)) for s in (self._unverified, self._off_place)
@@ -144,7 +147,7 @@ class DoubtfulPositions(Part):
         return reasons
 
     def _on_target(self, points: FloatArray) -> Mask:
-        """Return a mask of the points (K, 3) at a target, and closer to it than to a receiver."""
+        """Return a mask of the points (K, 3) at a target and closer to it than to a receiver."""
         apart, away = (
             np.linalg.norm(points[:, None] - centers, axis=-1)
             for centers in (self._targets, self._receivers)

@@ -1,4 +1,4 @@
-"""Whether drives move their mirrors: today's measured evidence, and the drives that stall.
+"""Checks whether drives move their mirrors: today's measured evidence, and the stalled drives.
 
 Step counts are the steps that a board has sent to its motors. With ice, a loose coupling or an
 unpowered driver the mirror stays where it is while the counts continue. A motion diagnosis with a
@@ -34,7 +34,7 @@ _POLL = 0.5
 
 
 class DriveChecks(Part):
-    """Evidence about the drives beyond their step counts.
+    """Collects evidence about the drives beyond their step counts.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class DriveChecks(Part):
         self._silent: set[str] = set()
 
     async def checked(self, heliostats: Iterable[str], timeout: float) -> None:
-        """Wait until none of the heliostats is due any longer, for at most ``timeout`` s."""
+        """Wait, for at most ``timeout`` s, until none of the heliostats is due any longer."""
         until = self._clock.monotonic() + timeout
         while self.due.intersection(heliostats) and self._clock.monotonic() < until:
             await sleep_until(self._clock, self._clock.monotonic() + _POLL)
@@ -141,7 +141,7 @@ class DriveChecks(Part):
         self._follows(heliostat)
 
     def confirm(self, heliostat: str) -> None:
-        """Accept a confirmation that the mirror follows its drives, which makes a diagnosis due."""
+        """Accept a confirmation that the mirror follows its drives; a diagnosis becomes due."""
         self._diagnosed.pop(heliostat, None)
         self._follows(heliostat)
 

@@ -18,12 +18,13 @@ _NAMED = 5
 
 
 class Firmware(Part):
-    """The comparison of firmware versions.
+    """Compares the boards' firmware versions with the expected version.
 
     Parameters
     ----------
     expected
-        Version that every board should have; None: nothing is compared, and no bus is searched.
+        Version that every board should have; None: no versions are compared, and no bus is
+        searched.
     clusters
         The clusters, which are queried.
     tell
@@ -39,7 +40,7 @@ class Firmware(Part):
         self._raised: set[str] = set()
 
     def on_connected(self, cluster: str, now: float) -> None:
-        """Have the boards of a newly connected cluster compared."""
+        """Make the comparison due for the boards of a newly connected cluster."""
         if self._expected is not None:
             self._due[cluster] = now
 

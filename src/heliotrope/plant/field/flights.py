@@ -1,8 +1,8 @@
 """Drone flights imported into the plant, and what its mirrors reveal about shared errors.
 
 The fit of a heliostat needs the information from all other heliostats about the errors that they
-share, but must not count its own information twice. The sum is therefore stored in parts, one per
-heliostat (`CommonFit.information`).
+share, but must not count its own information twice. The information is therefore stored separately
+for each heliostat (`CommonFit.information`).
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -32,13 +32,13 @@ class TakenFlight:
     flight
         The flight.
     identities
-        Numbers of its sightings in the store, 0 without a store, (M,).
+        Numbers of its sightings in the store, (M,); 0 if there is no store.
     at
         When it was imported, POSIX s.
     person
         Who imported it.
     left_out
-        Heliostats whose records must belong to other heliostats, and are left out of all fits.
+        Heliostats to which records were wrongly attributed; these records are left out of all fits.
     """
 
     flight: Flight
@@ -93,7 +93,7 @@ class Flights:
         return sum(map(len, self._rows.get(heliostat, ())))
 
     def adding(self, new: TakenFlight) -> "Flights":
-        """Return the flights with a new one added; beyond `MOST` the oldest are left out."""
+        """Return the flights with a new flight added, but only the last `MOST` flights."""
         taken = (*self._taken, new)
         oldest = len(taken) - MOST if len(taken) > MOST else 0
         first, size = self._edges[oldest], len(new.flight.shared)
@@ -116,12 +116,15 @@ class Flights:
             self._parts[heliostat] = information, pull
 
     def leave_out(self, heliostats: Collection[str]) -> None:
-        """Exclude the last flight's records of these heliostats from all fits, as not theirs."""
+        """Exclude these heliostats' records from the last flight from all fits.
+
+        The records belong to other heliostats.
+        """
         last = replace(self._taken[-1], left_out=frozenset(heliostats))
         self._set((*self._taken[:-1], last))
 
     def number(self, flight: str, identities: Identities) -> None:
-        """Store the numbers that the store assigned to the sightings of a flight, (M,)."""
+        """Remember the numbers that the store assigned to the sightings of a flight, (M,)."""
         self._set(
             tuple(
                 replace(flown, identities=identities) if flown.flight.name == flight else flown
@@ -130,7 +133,7 @@ class Flights:
         )
 
     def shared(self, but: Collection[str] = ()) -> tuple[FloatArray, FloatArray]:
-        """Return mean and covariance of all shared errors, (K,) and (K, K).
+        """Return the mean (K,) and the covariance (K, K) of all shared errors.
 
         Parameters
         ----------
@@ -149,7 +152,7 @@ class Flights:
         return covariance @ drawn, 0.5 * (covariance + covariance.T)
 
     def of_flight(self, number: int) -> tuple[FloatArray, FloatArray]:
-        """Return mean and covariance of the shared errors of one flight, numbered from 0."""
+        """Return the mean and the covariance of the shared errors of one flight, counted from 0."""
         mean, covariance = self.shared()
         part = slice(self._edges[number], self._edges[number + 1])
         return mean[part], covariance[part, part]
@@ -170,7 +173,8 @@ class Flights:
         heliostats
             N names; the sightings refer to them by index from 0.
         photographed
-            The sightings of each from photographs, with heliostat row 0; None if there are none.
+            Each heliostat's sightings from photographs, with heliostat index 0; None if there are
+            none.
         """
         parts: list[Sightings] = []
         shifts: list[FloatArray] = []

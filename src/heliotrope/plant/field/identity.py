@@ -1,9 +1,9 @@
-"""Which board responds at an address: swapped addresses, or a board moved to another heliostat.
+"""Detects which board responds at an address: swapped addresses, and boards moved elsewhere.
 
 Every local controller reports the checksum of the armature that it stores. The armature contains
-the position of the mirror, so no two are equal, and the checksum of another heliostat's armature
-reveals that heliostat's board: a command to H1 would move H2. A checksum that the plant has never
-seen does not reveal whose board it is.
+the position of the mirror, so no two armatures are equal. If a board at the address of H1 reports
+the checksum of H2's armature, it is the board of H2, and a command to H1 would move H2. A checksum
+that the plant has never seen does not reveal whose board it is.
 """
 
 import math
@@ -47,7 +47,7 @@ class Identities(Part):
     Attributes
     ----------
     mismatched
-        Why the board at a heliostat's address is not its own, by name.
+        Why the board at a heliostat's address is not the heliostat's own board, by name.
     """
 
     def __init__(
@@ -114,7 +114,10 @@ class Identities(Part):
         self._unlisted = (self._unlisted - known) | unlisted
 
     def _judge(self, changed: list[int]) -> None:
-        """Evaluate rows whose checksum, or its owners, have changed, together with their pairs."""
+        """Evaluate the heliostats whose checksum, or its owners, have changed.
+
+        For each pair of heliostats with swapped boards, both are named.
+        """
         for row in changed:
             self._own[row] = row in self._of(row)
             alien = not self._own[row] and bool(self._of(row))
@@ -140,11 +143,11 @@ class Identities(Part):
             self._give_up(reasons[new[0]], frozenset(new))
 
     def _of(self, row: int) -> set[int]:
-        """Return the rows of the heliostats that have ever had the armature of a row."""
+        """Return the indices of the heliostats that ever had the armature that a board reports."""
         return self._owners.get(int(self._stored[row]), set())
 
     def untrusted(self, heliostat: str) -> str | None:
-        """Return the reason why a heliostat's reports do not reveal its beam, None if they do.
+        """Return why a heliostat's reports do not reveal where its beam is; None if they do.
 
         The heliostat is mismatched, or its board stores an armature unknown to the plant, so its
         step counts belong to the heliostat where the board was before.
@@ -154,7 +157,7 @@ class Identities(Part):
         return self.mismatched.get(heliostat) or (_UNKNOWN if unknown else None)
 
     def blocked(self, heliostat: str) -> str | None:
-        """Return the reason why a heliostat may be neither moved nor written to, None if it may."""
+        """Return why a heliostat may be neither moved nor written to; None if it may be."""
         field, row = self._field, self._field.place(heliostat)
         cluster = field.clusters[field.cluster[row]]
         if heliostat in self.mismatched:

@@ -1,4 +1,4 @@
-"""Learning for heliostat groups, in a process separate from the plant."""
+"""Learns heliostat groups in a process separate from the plant."""
 
 import asyncio
 import os
@@ -16,7 +16,7 @@ _MODULE = "heliotrope.calibration.learn.worker"
 
 
 class LearnerProcess:
-    """Learns groups, each in a separate process that uses the computing time left by the plant.
+    """Learns groups, each in a separate process that uses the processor time left by the plant.
 
     Parameters
     ----------

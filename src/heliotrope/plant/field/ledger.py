@@ -1,12 +1,12 @@
-"""The ledger: which orders each heliostat was sent and has acknowledged, by kind of order.
+"""The ledger: the orders that each heliostat was sent and has acknowledged, by kind of order.
 
 A report does not reflect an order that the board had not received when it made the report. A path
-is proven clear from the last reported position of a heliostat. If another order has been sent
-since, the heliostat may have left that position, and be on an unproven path. The ledger decides
-whether a report counts, and which of two orders came later.
+is checked from the last reported position of a heliostat. If another order has been sent since, the
+heliostat may have left that position, and be on an unchecked path. The ledger decides whether a
+report counts, and which of two orders came later.
 
-A heliostat that leaves the receiver counts as lost unless it was ordered off; `losses` uses the
-ledger for this, too.
+A heliostat that leaves the receiver counts as lost unless it was ordered off; `losses` looks this
+up in the ledger.
 """
 
 from collections.abc import Sequence
@@ -54,7 +54,7 @@ class _Column:
     sent
         When it was first sent, monotonic s, (N,).
     acknowledged, accepted
-        When the last acknowledged order was acknowledged, and accepted by the plant, (N,).
+        When the last acknowledged order was acknowledged, and when the plant had accepted it, (N,).
     shown
         Time from which reports show the effect of the order, (N,).
     """
@@ -100,7 +100,7 @@ class Ledger(Part):
     def on_stage(
         self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
     ) -> None:
-        """Note what some heliostats of a ticket acknowledged or refused."""
+        """Note that some heliostats of a ticket acknowledged or refused its order."""
         if stage is Stage.ACKNOWLEDGED:
             self.acknowledged(ticket.name, ticket.accepted_at, heliostats, now)
         elif stage is Stage.REFUSED:
@@ -145,9 +145,9 @@ class Ledger(Part):
             column.acknowledged[mine], column.accepted[mine] = now, accepted_at
 
     def refused(self, name: str, heliostats: Sequence[str], now: float) -> None:
-        """Note that heliostats refused a command; they may not be where they were last reported.
+        """Note that heliostats refused a command, so they may not be where they last reported.
 
-        A refusal that the reported state explains, such as that of APPROACH in TRACKING, is
+        A refusal that the reported state explains, such as a refusal of APPROACH in TRACKING, is
         ignored.
         """
         state = self._field.rows["state"]
@@ -157,7 +157,7 @@ class Ledger(Part):
         self._refused_at[odd] = now
 
     def follows_loss(self, heliostats: Sequence[str]) -> None:
-        """Note that heliostats were ordered off because something was lost: see `off`."""
+        """Note that heliostats were ordered off because something was lost; see `off`."""
         self._off_at[self._rows(heliostats)] = -np.inf
 
     def _rows(self, heliostats: Sequence[str]) -> Rows:
@@ -167,7 +167,10 @@ class Ledger(Part):
         return [(kind, column) for kind, column in self._kinds.items() if name in kind]
 
     def _moved(self, kind: Kind, name: str, rows: Rows) -> Rows:
-        """Return the rows (K,) for which an order is of a kind; some points move nothing."""
+        """Return the indices (K,) of the heliostats for which an order is of a kind.
+
+        An order with a point moves a heliostat only in some states.
+        """
         if kind is not MOVING or name not in _POINTS:
             return rows
         return rows[np.isin(self._field.rows["state"][rows], _POINTS[name])]
@@ -179,18 +182,18 @@ class Ledger(Part):
         return np.asarray(self._field.heard >= self._kinds[kind].shown)
 
     def sent_since(self, kind: Kind, at: float) -> Mask:
-        """Return a mask of the heliostats first sent their last order of a kind since a time, (N,).
+        """Return a mask of the heliostats whose last order of a kind was new since ``at``, (N,).
 
-        ``at`` is in monotonic s; a repetition does not count.
+        ``at`` is in monotonic s. An order is new when it is first sent; a repetition is not new.
         """
         return np.asarray(self._kinds[kind].sent >= at)
 
     def later(self, kind: Kind, other: Kind) -> Mask:
-        """Return a mask of the heliostats last sent one kind of order after the other, (N,)."""
+        """Return a mask of the heliostats whose last ``kind`` order followed the last ``other``."""
         return np.asarray(self._kinds[kind].number > self._kinds[other].number)
 
     def obeyed_since(self, kind: Kind, at: float, after: Kind) -> Mask:
-        """Return a mask of the heliostats that acknowledged an order of a kind since a time, (N,).
+        """Return a mask of the heliostats that acknowledged an order of a kind since ``at``, (N,).
 
         The order counts only if it was accepted after the last order of the kind ``after`` was
         sent.
@@ -200,7 +203,9 @@ class Ledger(Part):
         return np.asarray(in_order & (column.acknowledged >= at))
 
     def off(self, out_at: FloatArray, now: float) -> Mask:
-        """Return a mask of the heliostats that anyone ordered off, (N,); call it at each check.
+        """Return a mask of the heliostats that were ordered off by anyone, (N,).
+
+        Call this method at each check.
 
         The order off was the last one, or was sent after the beam was last out (``out_at``,
         monotonic s, (N,)). An order does not count if the heliostat may have left by itself: it was

@@ -54,7 +54,7 @@ class Lockouts:
         return tuple(name for kind, name in self._locks if kind is Kind.HELIOSTAT)
 
     def put(self, locks: Iterable[Lockout]) -> None:
-        """Apply locks; a new lock replaces the same person's earlier lock."""
+        """Apply locks; a new lock replaces the same person's earlier lock on the object."""
         for lock in locks:
             self._locks.setdefault((lock.kind, lock.name), {})[lock.who] = lock
 
@@ -74,7 +74,7 @@ class Lockouts:
         return "; ".join(lock.text for lock in self.on(kind, name))
 
     def closed(self, points: FloatArray) -> dict[str, npt.NDArray[np.bool_]]:
-        """Return masks of the points (K, 3), ENU, m, on locked surfaces, by reason."""
+        """Return, by reason, a mask of the points (K, 3), ENU, m, that lie on locked surfaces."""
         masks = {}
         for kind, name in self._locks:
             surface = self._surfaces.get((kind, name))
@@ -87,14 +87,15 @@ class Lockouts:
     def reasons(
         self, heliostats: Sequence[str], points: FloatArray | None = None
     ) -> list[str | None]:
-        """Return the reasons why no command may move heliostats, None for those that may move.
+        """Return, for each heliostat, why no command may move it; None if it may be moved.
 
         Parameters
         ----------
         heliostats
             Names (K).
         points
-            Points to which their beams are to be sent, ENU, m, (K, 3); None: to no surface.
+            Points to which their beams are to be sent, ENU, m, (K, 3); None: the beams go to no
+            surface.
         """
         tower = self.text(Kind.TOWER, TOWER)
         texts = np.full(len(heliostats), f"the tower is locked: {tower}" if tower else None, "O")

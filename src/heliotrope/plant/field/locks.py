@@ -2,8 +2,8 @@
 
 A visit unlocks its heliostats itself. If it cannot, because an emergency is active, an operator's
 order has taken the heliostat out of the visit or the visit was cancelled, the plant unlocks them as
-soon as it may (`giving_back`). A local controller stays LOCKED through DEFOCUS and STOW, and UNLOCK
-stops it; a heliostat that was ordered off is therefore unlocked at stow.
+soon as it may (`giving_back`). A local controller stays LOCKED during DEFOCUS and STOW, and UNLOCK
+would stop its motion; a heliostat that was ordered off is therefore unlocked only at stow.
 
 A lock is stored on disk before it is applied (`assigned.HELD`). A program that finds such a lock
 does not know what was ordered after the previous program ended, so it sends the heliostat to stow
@@ -33,7 +33,8 @@ _WAIT = "wait"
 class _Lock:
     """A lock: its mandate, the next attempt, and whether it was released.
 
-    ``at`` is when it was applied, POSIX s; an earlier program applied it if it is ``recalled``.
+    ``at`` is when the lock was applied, POSIX s; ``recalled`` says that an earlier program applied
+    it.
     """
 
     token: int
@@ -84,10 +85,10 @@ class Locks:
         return {"LOCKED": dict.fromkeys(heliostats, place)}
 
     def reason(self, heliostat: str, visit: str, held: str = "") -> str:
-        """Return the reason why a heliostat is LOCKED, since when and until when, in words.
+        """Return in words why a heliostat is LOCKED, since when, and until when.
 
-        ``visit`` names the visit that holds it, if any. ``held`` is the reason why its cluster may
-        begin no motion now, if there is one.
+        ``visit`` names the visit that holds the heliostat, if any. ``held`` is the reason why its
+        cluster may begin no motion now, if there is one.
         """
         lock = self._locked.get(heliostat)
         if lock is None:
@@ -116,14 +117,14 @@ class Locks:
         )
 
     def forget(self, heliostats: Iterable[str]) -> None:
-        """Forget heliostats that an operator locks, because the operator unlocks them."""
+        """Forget heliostats that an operator locks, because the operator will unlock them."""
         for name in heliostats:
             self._locked.pop(name, None)
 
     def due(
         self, now: float, released: Callable[[int, Iterable[str]], frozenset[str]]
     ) -> dict[str, list[str]]:
-        """Return the heliostats to which an order is due now, by name of the order.
+        """Return the heliostats that must be sent an order now, by name of the order.
 
         Parameters
         ----------
@@ -147,9 +148,9 @@ class Locks:
         return orders
 
     def _next(self, name: str, lock: _Lock) -> str | None:
-        """Return the next order for a heliostat, None once its lock is removed.
+        """Return the next order for a heliostat; None once its lock is removed.
 
-        It waits for an operator if the owner of the lock is unknown.
+        If the owner of the lock is unknown, no order is due until an operator acts.
         """
         node = self._field.rows[self._field.index[name]]
         if node["state"] != states.LOCKED:
@@ -171,7 +172,10 @@ class Locks:
                 del self._locked[name]
 
     def under_way(self, heliostats: Iterable[str]) -> frozenset[str]:
-        """Return the heliostats sent to stow since they were locked, which need nothing more."""
+        """Return the heliostats that have been sent to stow since they were locked.
+
+        They need no further order.
+        """
         stowing = self._ledger.later(STOWING, LOCKING)
         return frozenset(name for name in heliostats if stowing[self._field.index[name]])
 

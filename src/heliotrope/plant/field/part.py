@@ -1,4 +1,4 @@
-"""Hooks that notify the parts of a plant of events, in the order of their list."""
+"""Hooks that notify the parts of a plant of events, in the order in which the parts are listed."""
 
 from collections.abc import Sequence
 
@@ -15,13 +15,13 @@ class Part:
     """
 
     def on_connected(self, cluster: str, now: float) -> None:
-        """Handle a newly connected cluster, where any boards may respond."""
+        """Handle a newly connected cluster; the boards there may have been replaced."""
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
         """Handle a cluster's status, which the state of the field already contains."""
 
     def on_rows(self, cluster: str, now: float) -> None:
-        """Handle the rows of a cluster, once every part has handled its status."""
+        """Handle the rows of a cluster's status, once every part has handled the status."""
 
     def on_alarm(self, cluster: str, alarm: Alarm) -> None:
         """Handle an alarm of a cluster."""
@@ -39,7 +39,7 @@ class Part:
     def on_stage(
         self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
     ) -> None:
-        """Note what some heliostats of a ticket acknowledged, refused or completed."""
+        """Note that some heliostats of a ticket acknowledged, refused or completed its order."""
 
     def on_beat(self, now: float) -> None:
         """Run the tasks of every beat (`PlantSettings.beat`)."""

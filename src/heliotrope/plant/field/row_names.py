@@ -1,4 +1,4 @@
-"""Heliostat names of the rows in a cluster's status, requested again if the message was lost."""
+"""Names of the heliostats in a cluster's status rows, requested again if a message was lost."""
 
 import math
 
@@ -12,7 +12,7 @@ _AGAIN = 5.0
 
 
 class RowNames(Part):
-    """Queries for the names of rows.
+    """Queries the heliostat names that belong to status rows.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ class RowNames(Part):
         self._asked_at = dict.fromkeys(field.clusters, -math.inf)
 
     def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
-        """Query the names of rows that the plant cannot interpret."""
+        """Query the heliostat names if the plant cannot interpret the rows of a status."""
         del status
         if self._field.knows_order(cluster) or now - self._asked_at[cluster] < _AGAIN:
             return

@@ -1,4 +1,4 @@
-"""Detects another plant with the same keys: clusters report which run they belong to."""
+"""Detects another plant with the same keys, because clusters report which run they obey."""
 
 from collections.abc import Callable, Iterable
 
@@ -8,7 +8,7 @@ from heliotrope.safety import Alarm, alarms
 
 
 class SecondPlant(Part):
-    """Clusters that refuse this plant because they belong to another one.
+    """Detects clusters that refuse this plant because they belong to another plant.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class SecondPlant(Part):
             self._tell(alarms.SECOND_PLANT.ended())
 
     def refusal(self, clusters: Iterable[str]) -> str | None:
-        """Return the reason why clusters accept no motion from this plant, None if they do."""
+        """Return why clusters accept no motion from this plant; None if they accept motion."""
         lost = sorted(set(clusters) & self._lost.keys())
         if not lost:
             return None

@@ -44,7 +44,7 @@ class HeliostatState:
     age
         Age of the values below, s; infinite if nothing was ever received.
     live
-        Whether the age is below the limit. If not, ``state`` is "" and the other values are
+        Whether the age is below the limit. If it is not, ``state`` is "" and the other values are
         meaningless.
     state, fault, flags
         State, fault and flags in words.
@@ -64,12 +64,12 @@ class HeliostatState:
 
     @property
     def text(self) -> str:
-        """One line."""
+        """The state of the heliostat in one line."""
         return f"{self.name}: {self.condition}"
 
     @property
     def condition(self) -> str:
-        """Its state and fault, or the time since its last report."""
+        """The state and the fault in words, or the time since the last report."""
         if not self.live:
             since = f"for {self.age:.0f} s" if math.isfinite(self.age) else "yet"
             return f"not heard {since}"
@@ -90,7 +90,7 @@ class FieldState:
     Attributes
     ----------
     names, index
-        The N names, and the index of each.
+        The N names, and the index of each name.
     clusters, members
         Names of the clusters, and of their heliostats.
     cluster
@@ -100,7 +100,7 @@ class FieldState:
     heard
         Time to which each row applies, monotonic s, (N,); minus infinity if nothing was received.
     counted_at
-        The same for its step counts and goals.
+        The same for the step counts and the goals in the row.
     posed, posed_state, posed_at
         Step counts when they were last known, (N, 2), the state at that time, and the time, (N,). A
         local controller that has lost its counts continues to report numbers, which are
@@ -112,7 +112,7 @@ class FieldState:
         boards may have been replaced.
     turned
         Whether a heliostat has moved since it was locked or in FAULT, (N,). If so, it has turned
-        away and will not turn further, unless it is locked again, which no status shows.
+        away and will not turn further, unless it was locked again between two statuses.
 
     Raises
     ------
@@ -157,7 +157,7 @@ class FieldState:
         Raises
         ------
         ProtocolError
-            If its block is not a whole number of rows.
+            If the data block is not a whole number of rows.
         """
         nodes, self.restarted = status.nodes(), ()
         if status.names:
@@ -204,13 +204,13 @@ class FieldState:
         return problems
 
     def _rows_of(self, cluster: str, names: Sequence[str]) -> npt.NDArray[np.intp]:
-        """Return the row of each name, -1 for a heliostat of another cluster."""
+        """Return the index of each named heliostat; -1 if it belongs to another cluster."""
         c = self.clusters.index(cluster)
         rows = [self.index.get(name, -1) for name in names]
         return np.array([r if r >= 0 and self.cluster[r] == c else -1 for r in rows], np.intp)
 
     def _note_failures(self, mine: npt.NDArray[np.intp], new: npt.NDArray[Any], at: float) -> None:
-        """Note failed heliostats: in FAULT, or silent although their cluster reports."""
+        """Note which heliostats are in FAULT, or silent although their cluster reports."""
         known = np.isfinite(self.heard[mine])
         before = self.rows["state"][mine] == states.FAULT
         faulty = known & ~before & (new["state"] == states.FAULT)
@@ -219,14 +219,14 @@ class FieldState:
         self.failed_at[mine[faulty | (known & silent & ~was_silent)]] = at
 
     def learn_order(self, cluster: str, names: tuple[str, ...]) -> None:
-        """Accept the names of a cluster's rows, in order."""
+        """Accept the heliostat names of a cluster's rows, in row order."""
         self._places[cluster] = (names, self._rows_of(cluster, names))
         members = self.members[cluster]
         self.unlisted.difference_update(members)
         self.unlisted.update(set(members).difference(names))
 
     def knows_order(self, cluster: str) -> bool:
-        """Whether the names of a cluster's rows are known."""
+        """Whether the heliostat names of a cluster's rows are known."""
         return cluster in self._places
 
     def place(self, name: str) -> int:
@@ -251,7 +251,7 @@ class FieldState:
         return np.asarray(self.age(now) <= self.limit)
 
     def values(self, field: str, now: float) -> "np.ma.MaskedArray[Any, Any]":
-        """Return one column of `NODE`, (N,), masked where stale.
+        """Return one column of `NODE`, (N,); the values of stale rows are masked.
 
         Raises
         ------
@@ -291,7 +291,7 @@ class FieldState:
         return {**counts, "stale": stale} if stale else counts
 
     def failed_share(self, now: float, span: float = 600.0) -> float:
-        """Return the fraction of heliostats that failed within a time span, s."""
+        """Return the fraction of heliostats that failed within the last ``span`` s."""
         return float(np.mean(now - self.failed_at < span))
 
     def of(self, name: str, now: float) -> HeliostatState:

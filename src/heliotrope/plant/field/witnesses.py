@@ -5,7 +5,7 @@ tracks without any fault indication, but misses its aim. Before the first helios
 receiver, a witness must therefore have seen the sun where the plant computes it: a satellite
 receiver (its time and its position), a sun sensor, or photographs of beams on targets. Until then
 beams may go to targets. While a witness contradicts the plant, no heliostat leaves stow, because
-the paths were proven clear for the computed sun.
+the paths were checked only for the computed sun direction.
 """
 
 import asyncio
@@ -51,12 +51,13 @@ class Witness(Protocol):
         ...
 
     async def sun(self, site: Site) -> tuple[FloatArray, float] | None:
-        """Return the unit vector to the sun now, ENU, (3,), and its error, rad; None: unknown.
+        """Return the unit vector to the sun now, ENU, (3,), and its error, rad; None if unknown.
 
         Parameters
         ----------
         site
-            Site of the plant, for its atmosphere; a witness that knows its own position uses that.
+            Site of the plant, for its atmosphere; a witness that knows its own position uses that
+            position.
         """
         ...
 
@@ -105,7 +106,7 @@ class SunSensorFile:
         self._path, self._written = path, 0
 
     async def sun(self, site: Site) -> tuple[FloatArray, float] | None:
-        """Return the sun vector from a file replaced since the last call; None if it was not."""
+        """Return the sun vector from the file; None if it was not replaced since the last call."""
         del site  # the sensor observes the sun itself
         return await asyncio.to_thread(self._read)
 
@@ -160,17 +161,17 @@ class Witnesses(Part):
         self._agreeing: set[str] = set()
 
     def _day(self, utc: float) -> int:
-        """Return the number of the day at the site, from midnight to midnight, mean solar time."""
+        """Return the day number at the site; days change at midnight, mean solar time."""
         return math.floor(utc / 86_400.0 + self._site.longitude_deg / 360.0)
 
     @property
     def contradiction(self) -> str | None:
-        """The reason why no heliostat may leave stow, None unless a witness contradicts the sun."""
+        """Why no heliostat may leave stow; None unless a witness contradicts the computed sun."""
         return self.refusal if self._contradicting else None
 
     @property
     def refusal(self) -> str | None:
-        """The reason why no heliostat may join a receiver, None if heliostats may."""
+        """Why no heliostat may join a receiver; None if heliostats may join."""
         if self._contradicting:
             problem = "; ".join(self._contradicting.values())
         elif self._names and self._agreed_on != self._day(self._utc()):
@@ -196,16 +197,16 @@ class Witnesses(Part):
     ) -> str | None:
         """Compare photographs of a heliostat's beam on a target, before they are used in a fit.
 
-        The beam reveals the sun direction if the heliostat was calibrated before today; a
-        calibration of today may come from a wrong sun direction. A single heliostat with a larger
-        miss may have moved, but two that indicate the same wrong sun direction have not. Returns
-        the reason not to use the photographs, if there is one: the sun direction that they assume
-        may be wrong.
+        The beam reveals the sun direction if the heliostat was calibrated before today; today's
+        calibration may rest on a wrong sun direction. If a single heliostat misses by more than its
+        error, the heliostat itself may have moved; if two heliostats indicate the same wrong sun
+        direction, they have not moved. Returns the reason not to use the photographs, if the sun
+        direction that they assume may be wrong.
 
         Parameters
         ----------
         record, mechanism
-            The believed calibration, None before the first; and its mechanism, batch shape (1,).
+            The believed calibration (None before the first), and its mechanism, batch shape (1,).
         sightings
             Sightings of the photographs.
         """
@@ -235,7 +236,10 @@ class Witnesses(Part):
 
     @property
     def awaits_photographs(self) -> bool:
-        """Whether photographs count and either no witness has agreed today or one contradicts."""
+        """Whether photographs count as a witness and the sun is not confirmed today.
+
+        It is not confirmed if no witness has agreed today, or if one contradicts the plant.
+        """
         return PHOTOGRAPHS in (self._names or ()) and bool(self.refusal)
 
     def on_second(self, now: float) -> None:

@@ -17,18 +17,18 @@ OWN, ALL = (10.0, 100.0), (30.0, 200.0)
 
 
 class BusyError(HeliotropeError):
-    """Too many orders; nothing was sent."""
+    """There were too many orders; nothing was sent."""
 
 
 class Admission:
-    """Counts orders.
+    """Counts orders, and refuses orders beyond the limits.
 
     Parameters
     ----------
     monotonic
-        Function that returns the time, s.
+        Function that returns monotonic time, s.
     own, everybody
-        Orders of one person, and of all persons: rate, 1/s, and burst.
+        Limits on the orders of one person, and on the orders of all users: rate, 1/s, and burst.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Admission:
         Raises
         ------
         BusyError
-            If there were too many orders of this person or of all persons.
+            If there were too many orders of this person or of all users.
         """
         whose, wait = f"of {person.name}", self._own.take(person.name)
         if wait == 0.0:

@@ -53,7 +53,7 @@ _LINK = re.compile(r"\[([^\]]+)\]\([^)]+\)")
 
 @dataclass(frozen=True)
 class WithBlob:
-    """A value, and the bytes that accompany it: for the API those of a JPEG."""
+    """A value, and the bytes that accompany it; in the API, the bytes are a JPEG."""
 
     value: Any
     blob: bytes
@@ -76,8 +76,8 @@ class Call:
     Attributes
     ----------
     function
-        Function that does the work in the plant's event loop; its arguments are those of ``desk``,
-        ``who``, ``order`` and ``blob`` that it needs.
+        Function that does the work in the plant's event loop; its arguments are whichever of
+        ``desk``, ``who``, ``order`` and ``blob`` it needs.
     request
         Method and path in the HTTP API, with arguments in braces; "": available only on the local
         interface.
@@ -98,11 +98,11 @@ class Call:
     fresh
         Time for which all callers share a reply, s; 0: replies are not shared.
     urgent
-        Whether it belongs to the socket for EMERGENCY, DEFOCUS and STOW.
+        Whether the call belongs to the socket for EMERGENCY, DEFOCUS and STOW.
     console
-        Whether only a console may make it.
+        Whether only a console may make the call.
     unlimited
-        Whether it does not count as an order; see `counted`.
+        Whether the call does not count as an order; see `counted`.
     """
 
     function: Callable[..., Any]
@@ -121,12 +121,12 @@ class Call:
 
     @property
     def counted(self) -> bool:
-        """Whether it is an order, whose rate is limited."""
+        """Whether the call is an order; the rate of orders is limited."""
         return self.role >= Role.OPERATOR and not (self.urgent or self.unlimited)
 
     @property
     def text(self) -> str:
-        """What it does or returns, in Markdown."""
+        """What the call does or returns, in Markdown."""
         return " ".join((inspect.getdoc(self.function) or "").split())
 
     @property
@@ -147,7 +147,7 @@ CALLS: dict[str, Call] = {}
 
 
 def _call(request: str = "", group: str = "", role: Role = VIEWER, **more: Any) -> Callable[[F], F]:
-    """Add a function to the table, under its name; see `Call`."""
+    """Return a decorator that adds a function to the table under its name; see `Call`."""
 
     def add(function: F) -> F:
         hints = get_type_hints(function)
@@ -193,8 +193,9 @@ async def flux(desk: Desk, order: orders.Named) -> views.PredictedView:
 def aims(desk: Desk) -> AimsView:
     """Return how aims are chosen, and how far the flux is from its limit.
 
-    `reserve`: least share of the limit that is left in any cell; `gap`: share of the power that
-    still better aims could add at most; `moved`: heliostats that moved last.
+    `reserve`: the smallest fraction of the limit that is unused in any cell; `gap`: the largest
+    fraction of power that better aims could still add; `moved`: the number of heliostats in the
+    last move.
     """
     return desk.operations.aims()
 
@@ -215,7 +216,8 @@ def size(desk: Desk) -> int:
 def heliostat(desk: Desk, order: orders.Named) -> views.HeliostatView:
     """Return one heliostat in detail.
 
-    `locked`: if it is LOCKED, by whose order or visit, since when, and until when.
+    `locked`: if the heliostat is LOCKED, by whose order or by which visit, since when, and until
+    when.
     """
     return desk.operations.viewer.heliostat(order.name)
 
@@ -224,8 +226,8 @@ def heliostat(desk: Desk, order: orders.Named) -> views.HeliostatView:
 def why(desk: Desk, order: orders.Named) -> views.Explanation:
     """Explain why a heliostat tracks or not, what happens next, and what an operator can do.
 
-    `order`: the last command to it, by whom and when; `button`: the command that `remedy` refers
-    to.
+    `order`: the last command to the heliostat, by whom and when; `button`: the command that
+    `remedy` refers to.
     """
     return desk.operations.why(order.name)
 
@@ -254,13 +256,18 @@ def emergency(desk: Desk) -> views.EmergencyView:
 
 @_call("POST emergency", "safety", bare=True, urgent=True)
 def order_emergency(desk: Desk, who: Person, order: orders.EmergencyCall) -> views.EmergencyView:
-    """Order a field-wide DEFOCUS (or STOW), with proof; open to everyone signed in."""
+    """Order a field-wide DEFOCUS (or STOW).
+
+    Every signed-in user may call it. The reply states how far the order has been carried out.
+    """
     return desk.order_emergency(who, order)
 
 
 @_call("DELETE emergency", "safety", OPERATOR, bare=True)
 def withdraw_emergency(desk: Desk, who: Person, order: orders.Withdrawal) -> views.EmergencyView:
-    """Withdraw your emergency order, or as an engineer that of an `owner`; nothing moves.
+    """Withdraw your own emergency order; nothing moves.
+
+    An engineer may also withdraw the order of another `owner`.
 
     The emergency continues while another person's order is active (`calls`).
     """
@@ -270,16 +277,18 @@ def withdraw_emergency(desk: Desk, who: Person, order: orders.Withdrawal) -> vie
 
 @_call("PUT readings/{name}", "safety", ENGINEER, body=orders.Reading)
 def give_reading(desk: Desk, who: Person, order: orders.NamedReading) -> None:
-    """Submit a reading for the safety table: its `value`, and `at`, the time of measurement.
+    """Submit a reading for the safety table.
 
-    Accepted only if the links file says [`"api"`](../how-to/integrate.md#sensors).
+    `value` is the reading, and `at` the time when it was measured.
+
+    The reading is accepted only if the links file says [`"api"`](../how-to/integrate.md#sensors).
     """
     desk.readings.take(who, order.name, order.value, order.at)
 
 
 @_call("GET alarms", "alarms", fresh=FRESH)
 def alarms(desk: Desk) -> tuple[views.AlarmRow, ...]:
-    """Return the alarms, those that need attention first."""
+    """Return the alarms; alarms that need attention come first."""
     return desk.operations.logbook.alarms()
 
 
@@ -293,20 +302,20 @@ def acknowledge(desk: Desk, who: Person, order: orders.Acknowledged) -> None:
 def events(desk: Desk, order: orders.Some) -> tuple[views.EventRow, ...]:
     """Return the latest events, newest first.
 
-    `heliostats`: the number of heliostats concerned, if `text` does not name them all.
+    `heliostats`: the number of heliostats concerned, if `text` does not name all of them.
     """
     return desk.operations.logbook.events(order.limit)
 
 
 @_call("GET events/{number}/heliostats", "logs")
 def event_heliostats(desk: Desk, order: orders.OneEvent) -> tuple[str, ...]:
-    """Return the names of all heliostats of an event whose text does not name them all."""
+    """Return all heliostats concerned by an event whose text names only some of them."""
     return desk.operations.logbook.named(order.number)
 
 
 @_call("GET journal", "logs")
 async def journal(desk: Desk, order: orders.Journal) -> tuple[JournalEntry, ...]:
-    """Return events, alarms and commands of all days from the store, the latest first.
+    """Return events, alarms, commands and notes from the store, for all days, newest first.
 
     `since` and `until` are POSIX seconds; `kind` is `event`, `alarm`, `command` or `note`.
     """
@@ -315,7 +324,7 @@ async def journal(desk: Desk, order: orders.Journal) -> tuple[JournalEntry, ...]
 
 @_call("GET report", "logs")
 async def report(desk: Desk, order: orders.Period) -> ShiftReport:
-    """Return the report for a time span: production, availability, calibrations, alarms, notes.
+    """Return the report for a period: production, availability, calibrations, alarms, notes.
 
     `since` and `until` are POSIX seconds, at most 31 days apart; 0 or omitted: the last eight
     hours. Energy and power are predictions.
@@ -325,16 +334,16 @@ async def report(desk: Desk, order: orders.Period) -> ShiftReport:
 
 @_call("GET trends", "logs")
 async def trends(desk: Desk) -> tuple[Quantity, ...]:
-    """Return the quantities that have trends, of the plant and of each heliostat."""
+    """Return the quantities that have trends, for the plant and for each heliostat."""
     return await desk.operations.quantities()
 
 
 @_call("GET trend", "logs")
 async def trend(desk: Desk, order: orders.TrendOrder) -> Trend:
-    """Return a quantity over time: minimum, mean and maximum per interval.
+    """Return how a quantity changed over time: its minimum, mean and maximum per interval.
 
-    `?quantity=power.receiver&since=…&until=…` in POSIX seconds; with `heliostat`, a quantity of
-    that heliostat.
+    `?quantity=power.receiver&since=…&until=…` with times in POSIX seconds; if `heliostat` is
+    specified, the quantity belongs to that heliostat.
     """
     return await desk.operations.trend(
         order.quantity, order.heliostat, order.since, order.until, order.points
@@ -343,7 +352,7 @@ async def trend(desk: Desk, order: orders.TrendOrder) -> Trend:
 
 @_call("POST notes", "logs", OPERATOR)
 def note_for_people(desk: Desk, who: Person, order: orders.NoteOrder) -> None:
-    """Store a note for the next shift, which the journal and the report show."""
+    """Store a note for the next shift; the journal and the report show it."""
     desk.operations.note(who, order.text)
 
 
@@ -355,7 +364,7 @@ def packets(desk: Desk, order: orders.SomePackets) -> tuple[views.PacketRow, ...
 
 @_call("POST clusters/{name}/frames", "logs", ENGINEER)
 async def bus_frames(desk: Desk, who: Person, order: orders.Named) -> tuple[views.BusFrame, ...]:
-    """Record the frames on a cluster's bus for five seconds, decoded; nothing moves."""
+    """Record the frames on a cluster's bus for five seconds and decode them; nothing moves."""
     found = await bus.record(desk.operations.plant, order.name)
     text = f"{order.name}: recorded {len(found)} frames of its bus"
     desk.operations.logbook.event("command", who.name, text)
@@ -371,7 +380,7 @@ def note(desk: Desk, order: orders.Note) -> None:
 
 @_call()
 def note_use(desk: Desk, who: Person, order: orders.Use) -> None:
-    """Record what a user of this computer did with the records; see `cli._noted`."""
+    """Record how a user of this computer used the records; see `cli._noted`."""
     kind = SecurityEvent[order.kind]
     desk.operations.security.note(kind, who.name, detail=order.detail)
 
@@ -401,7 +410,7 @@ def seize_authority(desk: Desk, who: Person, order: orders.GivenReason) -> Later
 
 @_call("PUT authority", "authority", OPERATOR, unlimited=True)
 def keep_authority(desk: Desk, who: Person) -> AuthorityState:
-    """Renew the command authority, every few seconds while its holder is present."""
+    """Renew the command authority; to be called every few seconds while its holder is present."""
     return desk.keep(who)
 
 
@@ -416,13 +425,13 @@ def release_authority(desk: Desk, who: Person) -> AuthorityState:
 
 @_call("POST stow", "commands", OPERATOR, urgent=True)
 def stow(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketState:
-    """Send heliostats to stow; needs no command authority."""
+    """Send heliostats to stow; this needs no command authority."""
     return desk.tickets.put(desk.operations.stow(who, order.heliostats))
 
 
 @_call("POST defocus", "commands", OPERATOR, urgent=True)
 def defocus(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketState:
-    """Move beams off the receiver; needs no command authority."""
+    """Move beams off the receiver; this needs no command authority."""
     return desk.tickets.put(desk.operations.defocus(who, order.heliostats))
 
 
@@ -430,7 +439,7 @@ def defocus(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketStat
 def command(desk: Desk, who: Person, order: orders.CommandOrder) -> Later[TicketState]:
     """Give a bus command.
 
-    APPROACH, TRACK, IDLE, REFOCUS, LOCK, UNLOCK, SEARCH, JOG, ZERO and more.
+    The commands are APPROACH, TRACK, IDLE, REFOCUS, LOCK, UNLOCK, SEARCH, JOG, ZERO and more.
     """
     here, token = desk.operations, desk.token_of(who)
     ticket: Ticket
@@ -464,9 +473,10 @@ def one_command(desk: Desk, order: orders.OneCommand) -> TicketState:
 
 @_call("POST aim", "commands", OPERATOR, body=orders.AimOrder, pack=orders.pack_points)
 def aim(desk: Desk, who: Person, order: orders.PointsOrder, blob: bytes) -> Later[TicketState]:
-    """Aim heliostats at a receiver or a target by name, or at points.
+    """Aim heliostats at a receiver or a target, selected by name, or at points.
 
-    `right` and `up`: a point on the unrolled receiver, m from its middle as seen from outside.
+    `right` and `up`: a point on the unrolled receiver, in metres from its middle, as seen from
+    outside.
     """
     if bool(order.where) == bool(order.points):
         raise InputError("aim: specify either where (a receiver or target) or points, not both")
@@ -492,8 +502,8 @@ def standby(desk: Desk, who: Person, order: orders.PointsOrder, blob: bytes) -> 
 def automatic(desk: Desk, who: Person, order: orders.SomeHeliostats) -> TicketState:
     """Give heliostats to automatic control, which raises and calibrates them.
 
-    Returns a ticket, which is done for a heliostat once it follows, and otherwise states the
-    reason.
+    Returns a ticket. It is done for a heliostat once the heliostat follows automatic control;
+    otherwise it states the reason.
     """
     return desk.tickets.put(desk.operations.give_back(who, order.heliostats))
 
@@ -520,8 +530,8 @@ def holds(desk: Desk) -> tuple[Lockout, ...]:
 def hold(desk: Desk, who: Person, order: orders.HoldOrder) -> TicketState:
     """Apply your lock to `heliostats`, `targets`, `receivers` or the `tower`.
 
-    The heliostats concerned go to stow, and nobody moves them. Returns a ticket, which is done for
-    a heliostat once it is parked at stow. Each person applies their own lock.
+    The heliostats concerned go to stow, and nobody can move them. Returns a ticket, which is done
+    for a heliostat once that heliostat is parked at stow. Each person applies their own lock.
     """
     return desk.tickets.put(desk.operations.hold(who, **order.model_dump(exclude_none=True)))
 
@@ -530,8 +540,8 @@ def hold(desk: Desk, who: Person, order: orders.HoldOrder) -> TicketState:
 def unhold(desk: Desk, who: Person, order: orders.GivenBack) -> tuple[Lockout, ...]:
     """Remove your locks; nothing moves.
 
-    As an engineer with `owner` and `reason`: remove that person's locks. A locked object is in
-    service again when nobody's lock is left.
+    An engineer may remove another person's locks by specifying `owner` and `reason`. An object
+    returns to service when the last lock on it is removed.
     """
     desk.operations.unhold(who, **order.model_dump())
     return desk.operations.automatic.service.out
@@ -545,7 +555,7 @@ def calibration(desk: Desk) -> views.CalibrationView:
     """Return the progress of calibration.
 
     `outlooks`: the first and the latest [prediction](../how-to/planning.md#in-the-running-plant) of
-    the field errors for this day; `field`: the actual errors so far; `choice`: why automatic
+    the field errors for this day; `field`: the actual errors up to now; `choice`: why automatic
     control chose the last visit, or starts none.
     """
     return desk.operations.automatic.view()
@@ -562,11 +572,11 @@ def switch_calibration(desk: Desk, who: Person, order: orders.Switch) -> views.C
 def calibrate(desk: Desk, who: Person, order: orders.OneCalibration) -> TicketState:
     """Calibrate a heliostat as soon as a target is free, before all others.
 
-    Returns a ticket that ends with the result. With `search` only its beam is searched for;
-    `together` names other heliostats that go to the target with it, in one [joint
-    visit](../explanation/plant.md#many-mirrors-on-one-target), as soon as all are ready; with
-    `receiver` all stay in production and are [measured on the
-    receiver](../explanation/plant.md#mirrors-in-production), as soon as all track it.
+    Returns a ticket that ends with the result. With `search`, the beam is only searched for.
+    `together` names other heliostats that go to the target in the same [joint
+    visit](../explanation/plant.md#many-mirrors-on-one-target), as soon as all are ready. With
+    `receiver`, all heliostats stay in production and are [measured on the
+    receiver](../explanation/plant.md#mirrors-in-production), as soon as all track the receiver.
     """
     return desk.tickets.put(desk.operations.calibrate(who, **order.model_dump()))
 
@@ -581,7 +591,7 @@ def schedule(desk: Desk, order: orders.SomeVisits) -> tuple[PlannedVisit, ...]:
 def timetable(desk: Desk) -> tuple[views.TimetableRow, ...]:
     """Return the [timetable](../explanation/schedule.md#the-timetable) of calibrations.
 
-    Each entry is returned with its next and last time, and the result of the last one.
+    Each entry is returned with its next time, its last time, and its last result.
     """
     return desk.operations.automatic.timetable.rows()
 
@@ -590,7 +600,7 @@ def timetable(desk: Desk) -> tuple[views.TimetableRow, ...]:
 def put_timetable(
     desk: Desk, who: Person, order: orders.TimetableOrder
 ) -> tuple[views.TimetableRow, ...]:
-    """Activate a timetable: all its `entries`; `null`: the timetable of the plant file.
+    """Activate a timetable with all its `entries`; `null`: the timetable of the plant file.
 
     An entry has the keys of the [plant file](plant-format.md#timetable).
     """
@@ -633,7 +643,7 @@ async def versions(desk: Desk, order: orders.TwoVersions) -> ParameterComparison
 
 @_call("POST parameters", "calibration", ENGINEER)
 async def set_parameters(desk: Desk, who: Person, order: orders.ParameterOrder) -> TicketState:
-    """Set error parameters of a heliostat at rest by `values`, or restore an earlier `version`.
+    """Set error parameters of a heliostat at rest to `values`, or restore an earlier `version`.
 
     The `reason` is recorded. If the plant file requires a
     [second approval](plant-format.md#second-approval), nothing is written and no command authority
@@ -654,15 +664,16 @@ async def set_parameters(desk: Desk, who: Person, order: orders.ParameterOrder) 
 
 @_call("GET parameters/waiting", "calibration")
 def waiting_changes(desk: Desk) -> tuple[WaitingChange, ...]:
-    """Return the changes of parameters that wait for the approval of a second engineer."""
+    """Return the parameter changes that wait for the approval of a second engineer."""
     return desk.operations.approvals.waiting
 
 
 @_call("POST parameters/waiting/{number}/approve", "calibration", ENGINEER)
 async def approve_change(desk: Desk, who: Person, order: orders.OneChange) -> TicketState:
-    """Approve another engineer's change: it is written now.
+    """Approve another engineer's change, which is then written at once.
 
-    You or its author must have the command authority. What cannot be written now waits on.
+    You or the author of the change must have the command authority. A change that cannot be written
+    now continues to wait.
     """
     return await desk.recorded(await desk.operations.approvals.approve(who, order.number))
 
@@ -705,8 +716,8 @@ async def take_photograph(desk: Desk, who: Person, order: orders.Named) -> Camer
 async def kept_photographs(desk: Desk, order: orders.KeptOf) -> tuple[views.PictureRow, ...]:
     """Return the newest stored photographs of a heliostat (`?heliostat=`).
 
-    Each is returned with the result of its visit; without a heliostat, photographs requested by
-    operators.
+    Each photograph is returned with the result of its visit. Without a heliostat, the photographs
+    that operators requested are returned.
     """
     return tuple(await desk.kept(order.heliostat, order.limit))
 
@@ -719,26 +730,29 @@ async def kept_photograph(desk: Desk, order: orders.KeptOne) -> WithBlob:
 
 @_call("POST targets/{name}/marks/picture", "calibration", ENGINEER)
 def begin_marks(desk: Desk, who: Person, order: orders.Named) -> PictureToMark:
-    """Hold the newest picture from a target's camera, so that its corners can be marked.
+    """Hold the newest picture from a target's camera, so that you can mark the target's corners.
 
-    Returns its `number`, size, the points with the pixels where they are expected, and where marks
-    are stored.
+    Returns the `number` and the size of the picture, the points with the pixels where they are
+    expected, and where marks are stored.
     """
     return desk.marking.begin(who, order.name)
 
 
 @_call("GET pictures-to-mark/{identity}", "calibration", ENGINEER)
 async def picture_to_mark(desk: Desk, order: orders.KeptOne) -> WithBlob:
-    """Return a held picture as JPEG, as taken by the camera; the last four are held."""
+    """Return a held picture as JPEG, as taken by the camera.
+
+    The last four pictures are held.
+    """
     return WithBlob({"number": order.identity}, await desk.marking.picture(order.identity))
 
 
 @_call("POST targets/{name}/marks", "calibration", ENGINEER, body=orders.Clicks)
 async def mark_corners(desk: Desk, who: Person, order: orders.Marks) -> MarksView:
-    """Test points clicked in a held picture (`number`, `points` as pixels by name).
+    """Test points clicked in a held picture: its `number`, and `points`, the pixels by point name.
 
-    Returns residuals, notes and the target seen from the front; with `save` (needs the command
-    authority) the camera uses them from now on.
+    Returns residuals, notes, and the target as seen from the front. With `save`, which needs the
+    command authority, the camera uses the points from now on.
     """
     token = desk.token_of(who) if order.save else None
     points = {name: (x, y) for name, (x, y) in order.points.items()}
@@ -756,7 +770,8 @@ def _flight_text(document: FlightDocument) -> tuple[dict[str, Any], bytes]:
 def flights(desk: Desk) -> tuple[views.FlightView, ...]:
     """Return the drone flights imported into the plant, the latest first.
 
-    Each record states what was done with its heliostats, and the errors that its records share.
+    Each entry states what was done with the heliostats of the flight, and the errors that its
+    records share.
     """
     return desk.operations.automatic.flights.views()
 
@@ -774,15 +789,16 @@ async def take_flight(desk: Desk, who: Person, blob: bytes) -> views.FlightView:
 
 @_call("GET learning", "calibration", fresh=FRESH)
 def learning(desk: Desk) -> tuple[views.LearningView, ...]:
-    """Return what was learnt about each heliostat group, when and from what, and what is in use."""
+    """Return what was learnt about each heliostat group, when, from what, and what is used."""
     return desk.operations.automatic.learning.views()
 
 
 @_call("POST learning", "calibration", ENGINEER)
 def learn(desk: Desk, who: Person, order: orders.OneGroup) -> tuple[views.LearningView, ...]:
-    """Learn drift, noise and installation errors of a `group` ("": all) now, as every night.
+    """Learn the drift, noise and installation errors of a `group` ("": all groups) now.
 
-    No heliostat moves; learning runs beside the plant, and `GET learning` reports the result.
+    The plant also does this every night. No heliostat moves; learning runs in a separate process,
+    and `GET learning` reports the result.
     """
     desk.operations.learn(who, order.group)
     return desk.operations.automatic.learning.views()
@@ -801,7 +817,7 @@ def asked(request: str) -> tuple[str, dict[str, Any]]:
     Raises
     ------
     InputError
-        If no call has this request; some requests are answered by the console alone.
+        If no call has this request; the console answers some requests by itself.
     """
     place, _, query = request.partition("?")
     for pattern, name in _REQUESTS:

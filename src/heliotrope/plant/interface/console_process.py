@@ -34,7 +34,7 @@ class Part:
     Attributes
     ----------
     name
-        Name in its signs of life.
+        Name that the process states in its signs of life.
     module
         Module of the program.
     alarm
@@ -64,7 +64,7 @@ class Patience:
     pause, longest
         First and longest pause before it is restarted.
     well
-        Running time after which the pause is short again.
+        Running time after which the pause returns to its first value.
     """
 
     begin: float = 90.0
@@ -84,13 +84,14 @@ class ConsoleProcess:
     part
         The part.
     listen
-        Function that returns its listening socket, the same each time, and the console settings as
-        JSON values; called in threads, raises `InputError` if the address is not available.
+        Function that returns the listening socket (the same at each call) and the console settings
+        as JSON values. It is called in threads, and raises `InputError` if the address is not
+        available.
     on_alarm
         Function that takes an alarm in the plant's event loop.
     on_address
-        Function called once, in the interface's thread, with the address at which it listens, when
-        the plant is running.
+        Function called once, in the interface's thread, with the address at which the process
+        listens, when the plant is running.
     patience
         See `Patience`.
 
@@ -196,7 +197,7 @@ class ConsoleProcess:
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """End the process, which ends when its input does; if it does not, kill it."""
+    """End the process by closing its input; kill the process if it does not end."""
     if process.stdin is not None:
         with contextlib.suppress(OSError):
             process.stdin.close()

@@ -1,4 +1,4 @@
-"""What the calls share in the plant's process: operations, tickets, and who is present.
+"""Everything that the calls share in the plant's process: operations, tickets, who is present.
 
 The command authority is renewed for a holder whose page or program has been active recently. It
 expires by the plant's time, which may run faster than real time.
@@ -43,7 +43,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class AuthorityState:
-    """Holder of the command authority ("": nobody), and its life without renewal, s."""
+    """Holder of the command authority ("": nobody), and its lifetime without renewal, s."""
 
     holder: str
     role: str
@@ -70,17 +70,17 @@ class FieldDesign:
     positions
         ENU, m, (N, 3).
     clusters, cluster
-        Names, and the place of each heliostat's in them, (N,).
+        Names of the clusters, and the index of each heliostat's cluster, (N,).
     size
-        Larger side of a mirror, m, the median.
+        Median of the mirrors' longer sides, m.
     tower
         Centre of the receivers, ENU, m, (3,).
     receivers, targets, keep_outs
-        Names, and outlines.
+        Names and outlines.
     surfaces
-        Places that `on` of a row names.
+        Places that a row's `on` refers to.
     states, faults
-        Names of the codes of a row.
+        Names of the codes in a row.
     """
 
     plant: str
@@ -115,7 +115,7 @@ class CameraReading:
 
 
 class Desk:
-    """The running plant, as the calls see it; used only in the plant's event loop.
+    """The running plant, as the calls use it; only for the plant's event loop.
 
     Parameters
     ----------
@@ -187,8 +187,8 @@ class Desk:
     async def told(self, person: Person, new: bool) -> AuthorityState:
         """Return the holder once a new token is known.
 
-        Clusters get it with a lease, and their local controllers a second later; until then the
-        field would refuse commands.
+        Clusters receive the token with a lease, and their local controllers a second later; until
+        then the field would refuse commands.
         """
         if new:
             await asyncio.sleep(1.5 * self.operations.plant.settings.period + 1.0)
@@ -212,7 +212,7 @@ class Desk:
     # -- commands --------------------------------------------------------------------------
 
     def order_emergency(self, who: Person, given: orders.EmergencyCall) -> EmergencyView:
-        """Order an emergency, once per identifier: the page sends its order over two paths."""
+        """Order an emergency, once per identifier, because the page sends each order twice."""
         key, now = (who.name, given.call), time.monotonic()
         if not given.call or now - self._called.get(key, -math.inf) >= SAME:
             self.operations.emergency(who, given.act, given.reason)
@@ -223,16 +223,17 @@ class Desk:
         return self.operations.viewer.emergency()
 
     async def recorded(self, ticket: Ticket) -> TicketState:
-        """Store a ticket; return its progress once it is recorded, or once that has failed.
+        """Store a ticket; return its progress once it is recorded or recording has failed.
 
-        The next command from the same client then finds the points that this command has assigned.
+        Waiting ensures that the next command from the same client finds the points that this
+        command has assigned.
         """
         self.tickets.put(ticket)
         await ticket.written(RECORDING + 1.0)
         return TicketState.of(ticket)
 
     async def resume(self, who: Person) -> None:
-        """Let automatic control continue, after waiting for an order that was just withdrawn.
+        """Let automatic control resume, after waiting for an order that was just withdrawn.
 
         Raises
         ------
@@ -315,7 +316,7 @@ class Desk:
 
 
 async def _answer(ask: Callable[[Callable[[T | Exception], None]], None]) -> T:
-    """Wait for the reply of a disk."""
+    """Wait for the disk's reply."""
     told: asyncio.Future[T] = asyncio.get_running_loop().create_future()
 
     def then(found: T | Exception) -> None:

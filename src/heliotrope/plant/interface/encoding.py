@@ -1,4 +1,4 @@
-"""Views as JSON values, and a frame of the field as the bytes of its arrays."""
+"""Encodes views as JSON values, and a frame of the field as the bytes of its arrays."""
 
 import dataclasses
 import math
@@ -47,7 +47,7 @@ def frame_parts(frame: FieldFrame) -> tuple[dict[str, Any], bytes]:
 
 
 def frame_of(head: Mapping[str, Any], blob: bytes) -> FieldFrame:
-    """Return the frame of `frame_parts`."""
+    """Return the frame that `frame_parts` has encoded."""
     values, at = dict[str, Any](), 0
     for field in dataclasses.fields(FieldFrame):
         value = head[field.name]

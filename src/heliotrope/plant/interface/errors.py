@@ -19,7 +19,7 @@ _CLASSES: dict[str, type[HeliotropeError]] = {
 
 
 def kind_of(error: HeliotropeError) -> tuple[str, str]:
-    """Return kind and text of an error."""
+    """Return the kind and the text of an error."""
     for kind, made in _CLASSES.items():
         if isinstance(error, made):
             return kind, str(error)
@@ -27,7 +27,7 @@ def kind_of(error: HeliotropeError) -> tuple[str, str]:
 
 
 def remade(error: CallError) -> HeliotropeError:
-    """Return the error that the plant's process raised."""
+    """Return the error that the plant's process raised, in the same class."""
     kind = _CLASSES.get(error.kind, HeliotropeError)
     # The text is complete; the constructor of `UnknownNameError` would create another text.
     made = kind.__new__(kind)

@@ -14,7 +14,7 @@ _RANDOM = 32
 
 
 class OneTimeLink:
-    """The secret of a link, valid once and for `VALID` s; only its hash is kept, in memory alone.
+    """The secret of a link, valid once and for `VALID` s; only its hash is kept, in memory.
 
     Any thread may call any method.
 
@@ -29,14 +29,14 @@ class OneTimeLink:
         self._made: tuple[bytes, str, float] | None = None
 
     def make(self, name: str) -> str:
-        """Return the secret of a new link for an account; earlier links end."""
+        """Return the secret of a new link for an account; earlier links become invalid."""
         secret = secrets.token_urlsafe(_RANDOM)
         with self._turn:
             self._made = _hash(secret), name, self._now() + VALID
         return secret
 
     def use(self, secret: str) -> str | None:
-        """Return the account that a secret signs in, and end the link; None if it is not valid."""
+        """Return the account that a secret signs in, and end the link; None if it is invalid."""
         with self._turn:
             if self._made is None:
                 return None

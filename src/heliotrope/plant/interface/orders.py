@@ -18,12 +18,14 @@ _FAR = 1e5
 
 
 def points_like(given: Any) -> Any:
-    """Return points whose shape is right; the first wrong one is named, not each of 200,000.
+    """Check the shape of points and return them.
+
+    The error names only the first wrong point, because there may be 200,000.
 
     Raises
     ------
     ValueError
-        A name or a point of another shape.
+        If a name or a point has the wrong shape.
     """
     for name, point in given.items() if isinstance(given, dict) else ():
         numbers = isinstance(point, list) and len(point) == 3 and all(map(_bounded, point))
@@ -37,14 +39,14 @@ def _bounded(value: Any) -> bool:
 
 
 class Strict(BaseModel):
-    """A request, without any further fields."""
+    """A request that may have no unknown fields."""
 
     model_config = ConfigDict(extra="forbid")
 
     @model_validator(mode="before")
     @classmethod
     def _few(cls, given: Any) -> Any:
-        """Refuse many unknown fields in one error, not in one each."""
+        """Refuse many unknown fields with one error, not with one error for each."""
         if isinstance(given, dict) and len(given) > len(cls.model_fields) + 5:
             raise ValueError("too many fields")
         return given
@@ -71,7 +73,7 @@ class Nothing(Strict):
 
 
 class Named(Strict):
-    """The name of one thing."""
+    """The name of one object."""
 
     name: Name
 
@@ -86,7 +88,7 @@ Limit = Annotated[int, Field(ge=1, le=2000)]
 
 
 class Some(Strict):
-    """The last ones, at most this many."""
+    """The newest entries, at most `limit`."""
 
     limit: Limit = 200
 
@@ -95,7 +97,7 @@ Moment = Annotated[float, Field(ge=0, le=1e11, allow_inf_nan=False, description=
 
 
 class Journal(Some):
-    """Entries of the journal: of a time, kind, person and heliostat, with a text."""
+    """Journal entries, selected by time, kind, person, heliostat and text."""
 
     since: Moment = 0.0
     until: Moment = 1e11
@@ -107,14 +109,14 @@ class Journal(Some):
 
 
 class Period(Strict):
-    """A time; `until` 0: now, and `since` 0: eight hours before."""
+    """A time span; `until` 0: now, and `since` 0: eight hours before `until`."""
 
     since: Moment = 0.0
     until: Moment = 0.0
 
 
 class TrendOrder(Period):
-    """A quantity over a time; `until` 0: now, and `since` 0: a day before."""
+    """A quantity over a time span; `until` 0: now, and `since` 0: a day before `until`."""
 
     quantity: Annotated[str, Field(min_length=1, max_length=100)]
     heliostat: Annotated[str, Field(max_length=64)] = ""
@@ -128,29 +130,29 @@ class NoteOrder(Strict):
 
 
 class SomePackets(Some):
-    """The last messages; of one cluster if it is named."""
+    """The last messages; only messages of one cluster if it is named."""
 
     cluster: Annotated[str, Field(max_length=64)] = ""
 
 
 class SomeVisits(Strict):
-    """The next visits, at most this many."""
+    """The next visits, at most `limit`."""
 
     limit: Limit = 20
 
 
 class Picture(Strict):
-    """A target, and the version of its photograph that is known already."""
+    """A target, and the version of its photograph that the client already has."""
 
     name: Name
     known: int = -1
 
 
 class OneCalibration(Strict):
-    """A heliostat to be calibrated next, and the target ("": any).
+    """A heliostat to be calibrated next, and the target ("": any target).
 
-    Only its beam is searched; or others are calibrated together with it, in one joint visit; or all
-    are measured on the receiver, where they shine.
+    Options: only search for its beam; or calibrate other heliostats together with it, in one joint
+    visit; or measure all of them on the receiver, where their beams are.
     """
 
     heliostat: Name
@@ -161,13 +163,13 @@ class OneCalibration(Strict):
 
 
 class OneGroup(Strict):
-    """A group of mirrors to be learnt now ("": all)."""
+    """A heliostat group to be learnt now ("": all groups)."""
 
     group: Annotated[str, Field(max_length=64)] = ""
 
 
 class TimetableOrderEntry(Strict):
-    """Heliostats that are calibrated at times of day, at intervals (from midnight UTC), or both."""
+    """Heliostats to calibrate at times of day, at intervals (from midnight UTC), or both."""
 
     name: Name
     heliostats: Annotated[list[Name], Field(min_length=1, max_length=20_000, fail_fast=True)]
@@ -186,26 +188,29 @@ class TimetableOrderEntry(Strict):
 
 
 class TimetableOrder(Strict):
-    """The whole timetable to put in force; null: that of the plant file."""
+    """The whole timetable to activate; null: the timetable of the plant file."""
 
     entries: Annotated[list[TimetableOrderEntry], Field(max_length=MOST)] | None
 
 
 class Reading(Strict):
-    """A reading of the safety table in the unit of its row, and when it was made, Unix s."""
+    """A reading for the safety table, in the unit of its row, and when it was measured, POSIX s."""
 
     value: Number
     at: Annotated[float, Field(ge=0.0, le=1e11, allow_inf_nan=False)]
 
 
 class NamedReading(Reading):
-    """`Reading` on the way to the plant: with its name."""
+    """A `Reading` as the console passes it to the plant, with its name."""
 
     name: Name
 
 
 class ParameterOrder(Strict):
-    """New error parameters of a heliostat by name, rad, m or 1, or an earlier version, and why."""
+    """New error parameters of a heliostat, or an earlier version to restore, and the reason.
+
+    The parameters are keyed by name, in rad, m or 1.
+    """
 
     heliostat: Name
     values: Annotated[dict[Name, Number], Field(max_length=40)] = {}
@@ -226,7 +231,7 @@ class OneChange(Strict):
 
 
 class ReasonGiven(Strict):
-    """Why."""
+    """The reason."""
 
     reason: Annotated[Words, Field(min_length=1)]
 
@@ -236,7 +241,7 @@ class RefusedChange(OneChange, ReasonGiven):
 
 
 class TwoVersions(Strict):
-    """A heliostat and two versions of its parameters; 0: those of the plant file."""
+    """A heliostat and two versions of its parameters; 0 is the version in the plant file."""
 
     name: Name
     first: Annotated[int, Field(ge=0, le=2**31)] = 0
@@ -248,7 +253,7 @@ PixelOf = Annotated[list[Coordinate], Field(min_length=2, max_length=2)]
 
 
 class Clicks(Strict):
-    """Points clicked in a picture to mark, and whether their view is to be used from now on."""
+    """Points clicked in a held picture, and whether the camera is to use them from now on."""
 
     number: Annotated[int, Field(ge=1, le=2**53)]
     points: Annotated[dict[Name, PixelOf], Field(max_length=200)]
@@ -256,20 +261,20 @@ class Clicks(Strict):
 
 
 class Marks(Clicks):
-    """`Clicks` on the way to the plant: with the target."""
+    """`Clicks` as the console passes them to the plant, with the target."""
 
     name: Name
 
 
 class KeptOf(Strict):
-    """The newest kept photographs of a heliostat ("": those that persons asked for)."""
+    """The newest stored photographs of a heliostat ("": photographs that operators requested)."""
 
     heliostat: Annotated[str, Field(max_length=64)] = ""
     limit: Limit = 50
 
 
 class KeptOne(Strict):
-    """A kept photograph."""
+    """A stored photograph."""
 
     identity: Annotated[int, Field(ge=1, le=2**53)]
 
@@ -277,7 +282,7 @@ class KeptOne(Strict):
 class Note(Strict):
     """A security event: its name, the person, the address of the caller, and details.
 
-    Or the sum of events that the console has counted, ``more``.
+    ``more`` is the number of further events that the console has only counted.
     """
 
     kind: Annotated[str, Field(pattern=f"^({'|'.join(SecurityEvent.__members__)})$")]
@@ -288,14 +293,14 @@ class Note(Strict):
 
 
 class Use(Strict):
-    """What a person on this machine did with the records: the name of its event, and details."""
+    """How a user of this computer used the records: the name of the event, and details."""
 
     kind: Annotated[str, Field(pattern="^(BACKED_UP|EXPORTED|QUERIED)$")]
     detail: Words
 
 
 class Beat(Strict):
-    """A sign of life: the part of a console that gives it, and where it listens."""
+    """A sign of life: the part of a console that sends it, and the address where it listens."""
 
     part: Annotated[str, Field(pattern="^(console|emergency)$")]
     address: Annotated[str, Field(max_length=200)]
@@ -308,16 +313,17 @@ class SomeHeliostats(Strict):
 
 
 class CommandOrder(SomeHeliostats):
-    """A command of the wire with its values, see the table of messages."""
+    """A bus command with its values; see the table of messages."""
 
     command: Annotated[str, Field(pattern=r"^[A-Z_]{2,20}$")]
     values: Annotated[list[Number], Field(max_length=8)] = []
 
 
 class AimOrder(SomeHeliostats):
-    """Aim heliostats at a receiver or target by its name, or at points by heliostat, ENU, m.
+    """Aim heliostats at a receiver or target by name, or each at its own point, ENU, m.
 
-    `right` and `up`: place on the unrolled receiver from its middle as seen from outside, m.
+    `right` and `up`: a point on the unrolled receiver, in metres from its middle, as seen from
+    outside.
     """
 
     where: Words = ""
@@ -333,7 +339,7 @@ class StandbyOrder(Strict):
 
 
 class PointsOrder(SomeHeliostats):
-    """`AimOrder` or `StandbyOrder` on its way: names of the points in the blob."""
+    """An `AimOrder` or `StandbyOrder` as passed to the plant; the blob holds the points."""
 
     where: Words = ""
     right: Coordinate | None = None
@@ -348,7 +354,7 @@ class GivenReason(Strict):
 
 
 class EmergencyCall(Strict):
-    """Order for the whole field, and the reason."""
+    """An emergency order for the whole field, and the reason."""
 
     act: Annotated[str, Field(pattern="^(DEFOCUS|STOW)$")] = "DEFOCUS"
     reason: Words = ""
@@ -363,20 +369,20 @@ class EmergencyCall(Strict):
 
 
 class Withdrawal(Strict):
-    """Whose emergency order to withdraw, as an engineer; "": one's own."""
+    """Whose emergency order to withdraw: "" for one's own; engineers may name another owner."""
 
     owner: Words = ""
 
 
 class Acknowledged(Strict):
-    """The alarm."""
+    """The alarm to acknowledge."""
 
     condition: Name
     subject: Words = ""
 
 
 class _Places(SomeHeliostats):
-    """Heliostats by their names, targets, receivers, or the tower; at least one of them."""
+    """Heliostats, targets and receivers by name, or the tower; at least one object."""
 
     targets: Names = []
     receivers: Names = []
@@ -390,14 +396,14 @@ class _Places(SomeHeliostats):
 
 
 class HoldOrder(_Places):
-    """What to take out of service, the reason, and the hours until it is expected back."""
+    """What to take out of service, the reason, and the expected duration in hours."""
 
     reason: Words
     hours: Annotated[float, Field(gt=0.0, le=8760.0)] | None = None
 
 
 class GivenBack(_Places):
-    """What to give back to service; an engineer may name the ``owner`` whose lock to remove."""
+    """What to return to service; an engineer may name the ``owner`` whose lock is removed."""
 
     owner: Words = ""
     reason: Words = ""
@@ -422,7 +428,7 @@ def points_of(order: PointsOrder, blob: bytes) -> dict[str, FloatArray]:
     Raises
     ------
     InputError
-        If there is not one point for each name, or one is not on the site.
+        If there is not exactly one point for each name, or a point is not on the site.
     """
     if len(blob) != 24 * len(order.points):
         raise InputError(f"points: {len(blob)} bytes for {len(order.points)} heliostats")

@@ -1,4 +1,4 @@
-"""The plant at one moment, as the live stream shows it along with the field's rows."""
+"""The state of the plant at one moment, which the live stream sends with the field's rows."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ WELL, TROUBLED, SILENT = 0, 1, 2
 
 
 def overview(operations: Operations) -> dict[str, Any]:
-    """Return the overview: views and numbers, not yet made plain."""
+    """Return the overview: views and numbers, not yet converted to JSON values."""
     summary, light = operations.summary(), operations.sun()
     calibration = operations.automatic.view()
     cameras = {}
@@ -44,7 +44,7 @@ def overview(operations: Operations) -> dict[str, Any]:
 
 
 def _newest(operations: Operations) -> float:
-    """Return the time of the last event, POSIX s; 0 before the first."""
+    """Return the time of the last event, POSIX s; 0 if there is none yet."""
     events = operations.logbook.events(1)
     return events[0].at if events else 0.0
 

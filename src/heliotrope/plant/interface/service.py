@@ -62,7 +62,10 @@ _END = 5.0
 
 @dataclass(frozen=True)
 class LocalCaller:
-    """Who is at the other end; a console (None) names the person with each request."""
+    """Who is at the other end of a connection.
+
+    A console (None) names the person with each request.
+    """
 
     person: Person | None
 
@@ -95,7 +98,7 @@ class PlantInterface:
     heard
         When each part of a console last sent a sign of life, monotonic time of the computer, s.
     addresses
-        Addresses at which they listen.
+        Addresses at which the parts of a console listen.
     """
 
     def __init__(self, operations: Operations, people: People, data: Path) -> None:
@@ -114,7 +117,9 @@ class PlantInterface:
     async def running(
         self, *beside: Callable[[], Coroutine[Any, Any, None]]
     ) -> AsyncIterator["PlantInterface"]:
-        """Serve during a block, in the plant's event loop; ``beside`` runs in the ordinary thread.
+        """Serve while a block runs; ``beside`` runs in the thread of the ordinary socket.
+
+        The block itself runs in the plant's event loop.
 
         Raises
         ------
@@ -145,7 +150,7 @@ class PlantInterface:
         return self._desk.operations.begun.is_set()
 
     def one_time_link(self, name: str, address: str) -> str:
-        """Return a link that signs an account in once, for a short time, without its password.
+        """Return a short-lived link that signs an account in once, without its password.
 
         Parameters
         ----------
@@ -179,17 +184,17 @@ class PlantInterface:
         return done
 
     async def _wait_in_plant(self, work: Coroutine[Any, Any, T]) -> T:
-        """Run work in the plant's event loop that waits there; awaited in another event loop."""
+        """Run awaitable work in the plant's event loop; this is awaited in another event loop."""
         assert self._plant is not None
         return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, self._plant))
 
     # -- who is calling --------------------------------------------------------------------
 
     async def _caller(self, socket: str, hello: dict[str, Any], user: int) -> LocalCaller | None:
-        """Return the caller of a first frame, None if key or token is not valid.
+        """Return the caller who sent a first frame; None if the key or the token is not valid.
 
-        The plant's own user and root need neither, because they could stop the plant or read its
-        store anyway. They may order EMERGENCY, DEFOCUS and STOW, and see everything.
+        The plant's own user and root need neither key nor token, because they could stop the plant
+        or read its store anyway. They may order EMERGENCY, DEFOCUS and STOW, and see everything.
         """
         key, token = hello.get("key"), hello.get("token")
         if hello == {"user": True}:
@@ -205,12 +210,12 @@ class PlantInterface:
         return None
 
     def _note(self, kind: SecurityEvent, who: str, detail: str) -> None:
-        """Record a security event; the log limits their number."""
+        """Record a security event; the log limits the number of events."""
         note = self._desk.operations.security.note
         self.in_plant(lambda: note(kind, who, detail=detail))
 
     async def _person(self, token: str) -> Person | None:
-        """Return the person of a token; if the store does not respond, as last known."""
+        """Return the person of a token, as last known if the store does not respond."""
         name = hashlib.sha256(token.encode()).hexdigest()
         try:
             async with asyncio.timeout(_STORE):
@@ -288,7 +293,7 @@ class PlantInterface:
 
 
 class _Turns:
-    """Runs one call at a time in the plant's event loop, for a fraction of its time."""
+    """Runs one call at a time in the plant's event loop, for a limited fraction of the time."""
 
     def __init__(self, interface: PlantInterface, share: float) -> None:
         self._interface, self._rest = interface, 1.0 / share - 1.0
@@ -371,7 +376,7 @@ def _called(head: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     Raises
     ------
     InputError
-        If there are none.
+        If the request has no name or no arguments.
     """
     name, given = head.get("call"), head.get("arguments")
     if not isinstance(name, str) or not isinstance(given, dict):
@@ -385,7 +390,10 @@ def _called(head: dict[str, Any]) -> tuple[str, dict[str, Any]]:
 def _people_calls(
     people: People, factors: Factors, link: OneTimeLink
 ) -> dict[str, Callable[..., Any]]:
-    """Return the calls that only a console may make, run in threads rather than in the loop."""
+    """Return the calls that only a console may make.
+
+    They run in threads rather than in the event loop.
+    """
     return {
         "people.account": people.account,
         "people.accounts": people.accounts,

@@ -18,7 +18,7 @@ class TicketState:
     Attributes
     ----------
     identity, command
-        Identity of its record in the audit, and its name.
+        Identity of the command's record in the audit, and the name of the command.
     heliostats
         Number of its heliostats.
     counted
@@ -28,11 +28,11 @@ class TicketState:
     good
         Whether every heliostat is done.
     text
-        The same for people.
+        The progress in words.
     refusals
-        Reasons of the first hundred.
+        Reasons for the first hundred heliostats that were refused.
     steps
-        What the first hundred of an operation do or wait for now, or their results.
+        What the first hundred heliostats of an operation do or wait for now, or their results.
     """
 
     identity: str
@@ -80,7 +80,7 @@ class Tickets:
         Raises
         ------
         UnknownNameError
-            If it is not among the last ones.
+            If it is not among the last commands.
         """
         ticket = self._kept.get(identity)
         if ticket is None:

@@ -36,11 +36,11 @@ class Views:
         return self._views.get(target, CameraView(target, 0, 0.0, b""))
 
     def show(self, name: str, at: float, jpeg: bytes, line: str) -> None:
-        """Store a picture without a reading, at a time (POSIX s), with a line of text."""
+        """Store a picture that has no reading, with its time (POSIX s) and a line of text."""
         self._views[name] = CameraView(name, self.view(name).version + 1, at, jpeg, (line,))
 
     def keep(self, name: str, at: float, seen: Photograph, jpeg: bytes) -> None:
-        """Store the reading of a target at a time (POSIX s), with its picture."""
+        """Store the reading of a target, with its time (POSIX s) and its picture."""
         reading = seen.reading(name)
         lines = [f"{reason.name}: {reason.text}" for reason in reading.reasons]
         centroid = None
@@ -92,7 +92,7 @@ def beam_of(
     settings: PhotographSettings,
     without: Frame | None = None,
 ) -> tuple[Photograph, bytes]:
-    """Return a frame's evaluation, see `read_photograph`, and its picture for display."""
+    """Return a frame's evaluation (see `read_photograph`) and its picture for display."""
     seen = read_photograph(frame, targets, camera, settings=settings, without=without)
     return seen, picture_of(seen)
 
@@ -116,7 +116,10 @@ def picture_of(seen: Photograph) -> bytes:
 
 
 def _brightened(seen: Photograph) -> Photograph:
-    """Return a brightened photograph, because beside a beam the target would look black."""
+    """Return a brightened photograph.
+
+    Without brightening, the target would look black beside a beam.
+    """
     frame = seen.frame
     top = 255.0 if frame.pixels.dtype == np.uint8 else 65535.0
     table = np.round(255.0 * np.linspace(0.0, 1.0, int(top) + 1) ** _GAMMA).astype(np.uint8)

@@ -63,7 +63,7 @@ def source_of(camera: Camera, folder: Path, stop: threading.Event) -> Source:
     Raises
     ------
     InputError
-        If there is no source, it is a recording, or its folder does not exist.
+        If there is no source, if the source is a recording, or if its folder does not exist.
     """
     who = f"camera {camera.name}"
     if not camera.source:
@@ -92,9 +92,9 @@ class Feed:
     Attributes
     ----------
     newest
-        The last frame, None before the first.
+        The last frame; None before the first frame.
     problem
-        Why no frame arrives, empty if nothing is wrong.
+        Why no frame arrives; "" if nothing is wrong.
     """
 
     def __init__(self, source: Source) -> None:
@@ -108,7 +108,7 @@ class Feed:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread; a thread that hangs in a driver is left behind."""
+        """End the thread; a thread that hangs in a driver is abandoned."""
         self._source.stop.set()
         self._source.wanted.set()
         if self._thread.is_alive():
@@ -156,7 +156,7 @@ class RealCameras:
     watched
         Cameras of receivers that are monitored apart from receiver visits, by receiver name.
     memory
-        Folder for models of empty targets; None: they are learnt again at each start.
+        Folder for models of empty targets; None: the models are learnt again at each start.
     patience
         Longest wait for a frame, s.
     sources
@@ -237,7 +237,7 @@ class RealCameras:
         return self._views.view(target)
 
     def eye(self, target: str) -> Camera:
-        """Return the camera of a target, as currently known; see `plant.ports.Cameras`."""
+        """Return the camera of a target as it is now known; see `plant.ports.Cameras`."""
         return self._eye(target).camera
 
     def frame(self, target: str) -> Frame:
@@ -249,7 +249,7 @@ class RealCameras:
         return eye.feed.newest
 
     def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
-        """Evaluate later photographs with a camera and target marks; see `plant.ports.Cameras`."""
+        """Set the camera and target marks for later photographs; see `plant.ports.Cameras`."""
         old = self._eye(target.name)
         targets = tuple(target if t.name == target.name else t for t in old.targets)
         new = _Eye(camera, targets, old.feed)
@@ -267,7 +267,7 @@ class RealCameras:
         return target in self._eyes
 
     def awake(self, target: str) -> bool:
-        """Return whether a target has a camera that is not silent, or delivers frames again."""
+        """Return whether a target has a camera that is not silent, or has recovered."""
         eye = self._eyes.get(target)
         if eye is None:
             return False
@@ -337,7 +337,7 @@ class RealCameras:
         return Exposed(at, asyncio.create_task(read()))
 
     async def _frame(self, eye: _Eye, target: str) -> Frame:
-        """Wait for a frame exposed from now on."""
+        """Wait for a frame that was exposed after this call."""
         asked, until = self._clock.utc(), self._clock.monotonic() + self._patience
         last = eye.feed.newest
         eye.feed.ask()
@@ -348,7 +348,7 @@ class RealCameras:
                     self._tell(target)
                 return frame
             if frame is not last:
-                # It was on its way already, or the camera's clock is a little behind.
+                # The frame was already on its way, or the camera's clock is slightly behind.
                 last = frame
                 eye.feed.ask()
             await asyncio.sleep(_LOOK)

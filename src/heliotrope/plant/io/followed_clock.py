@@ -1,4 +1,4 @@
-"""The clock of a simulated field, which the plant in control of the field follows.
+"""Makes a plant follow the clock of the simulated field that it controls.
 
 A simulated field may begin at a different time, run faster, and slow down if its computer is too
 slow. The plant polls the state of the field's clock five times per simulated second
@@ -41,15 +41,16 @@ class ClockState:
     Attributes
     ----------
     wall
-        When it was read, by this computer's monotonic clock, s.
+        When the state was read, by this computer's monotonic clock, s.
     now, utc
-        Its monotonic time, and its UTC in POSIX seconds.
+        The field's monotonic time, s, and its UTC in POSIX seconds.
     speed, asked
-        Its present and its requested seconds per second.
+        The present and the requested speed of the field's clock, seconds per second.
     waits, begun
         Whether the field waits for its plant; whether the plant controls all of it.
     ahead
-        Longest time by which the plant continues from it, s; infinite if the field has gone.
+        Longest time for which the plant extrapolates from this state, s; infinite if the field has
+        gone.
     """
 
     wall: float
@@ -62,7 +63,7 @@ class ClockState:
     ahead: float = _AHEAD
 
     def at(self, wall: float) -> float:
-        """Return its monotonic time at another time of this computer, as far as it is known."""
+        """Return the field's monotonic time at another time of this computer, if known."""
         return self.now + min(self.speed * (wall - self.wall), self.ahead)
 
 
@@ -112,7 +113,7 @@ class ClockReader:
         return (last.now - first.now) / span if span > 1.0 else last.speed
 
     async def begin(self) -> None:
-        """Start the simulated field once it is ready; its time stands still until then."""
+        """Start the simulated field's clock once the field is ready; until then it stands still."""
         while not self.state.waits:
             await asyncio.to_thread(time.sleep, _SOON)
         await asyncio.to_thread(self.fetch, "begin")
@@ -128,7 +129,7 @@ class ClockReader:
         Raises
         ------
         FetchError
-            If it does not reply.
+            If the simulated field does not reply.
         """
         try:
             with self._opener.open(f"{self._address}/{path}", timeout=_PATIENCE) as answer:
@@ -139,7 +140,7 @@ class ClockReader:
             ) from None
 
     def _first(self) -> ClockState:
-        """Return the first state; the simulated field may have just been started."""
+        """Return the first state; wait if the simulated field has only just been started."""
         until = time.monotonic() + _STARTING
         while True:
             try:

@@ -71,7 +71,7 @@ class MqttTable(Table):
 
 
 class WitnessTable(Table):
-    """``[witness]``: what sees the sun independently of the clocks and sites of the plant."""
+    """``[witness]``: sources of the sun's direction independent of the plant's clocks and site."""
 
     gpsd: str = Field(
         "",
@@ -92,7 +92,7 @@ class WitnessTable(Table):
 
 
 class ExpectedPolling(Table):
-    """``[polling]``: what every cluster file of this plant has in its table of that name."""
+    """``[polling]``: the values that every cluster file of this plant has in ``[polling]``."""
 
     steps_every_s: int = Field(
         CommonSettings.steps_every,
@@ -150,9 +150,9 @@ class LinksDocument(Table):
     )
 
 
-#: Says that programs give a reading, in place of the name of a file.
+#: Value that says, in place of a file name, that programs supply a reading.
 GIVEN = "api"
-#: Says that the receiver's camera gives its flux.
+#: Value that says that the receiver's camera measures its flux.
 CAMERA = "camera"
 #: The tables, for the reference and for hints.
 TABLES: tuple[type[Table], ...] = (
@@ -175,9 +175,9 @@ class LinksFile:
     document
         Its tables.
     keys
-        Keys by cluster; replaced while the links run if the key file changes.
+        Keys, by cluster; they are replaced while the links run if the key file changes.
     password
-        Password for the broker; replaced like the keys.
+        Password for the broker; it is replaced like the keys.
     """
 
     path: Path
@@ -186,7 +186,7 @@ class LinksFile:
     password: BrokerPassword
 
     def check(self, homes: Mapping[str, tuple[str, ...]]) -> None:
-        """Check that the file names every cluster of a plant and no other.
+        """Check that the file names every cluster of a plant, and no others.
 
         Parameters
         ----------
@@ -218,7 +218,7 @@ class LinksFile:
                 raise _keyless(self.path, name)
 
     def build(self, homes: Mapping[str, tuple[str, ...]], clock: Clock) -> "PlantLinks":
-        """Return the plant's ends of the links, and everything that must run beside them.
+        """Return the plant's ends of the links, and the tasks that must run beside them.
 
         Raises
         ------
@@ -255,7 +255,7 @@ class LinksFile:
         return made
 
     def _call(self, made: "PlantLinks", clock: Clock) -> None:
-        """Create the connections to the witnesses of the sun."""
+        """Create the connections to the sun witnesses."""
         table, names = self.document.witness, set()
         if table.gpsd:
             gpsd = Gpsd(clock, *gpsd_at(self.path, table.gpsd, "witness.gpsd"))
@@ -320,29 +320,32 @@ class PlantLinks:
     Attributes
     ----------
     papers
-        Their keys and certificates, to be watched beside the plant.
+        Keys and certificates of the links, to be monitored while the plant runs.
     links
         Links over TCP and MQTT, by cluster.
     parts
         Tasks to run beside the plant.
     local
-        Cluster files of clusters whose bus is at this machine, by cluster; they have no link yet.
+        Cluster files of clusters whose bus is attached to this computer, by cluster; these clusters
+        have no link yet.
     server
-        Server that clusters connect to; None if none does.
+        Server that clusters connect to; None if no cluster connects in this way.
     sensors
         Readings of the safety table from files.
     given
-        Readings of the safety table that programs give by the HTTP API.
+        Readings of the safety table that programs supply through the HTTP API.
     common
-        Settings that every cluster should have, as far as this file holds them.
+        Settings that every cluster should have, as far as this file contains them.
     witnesses, witnessed
-        Independent witnesses of the sun; names of all that count, as in `PlantSettings.witnesses`.
+        Independent witnesses of the sun, and the names of all that count, as in
+        `PlantSettings.witnesses`.
     firmware
-        Version that every board should have; None: it is not compared.
+        Version that every board should have; None: versions are not compared.
     light
-        Reference for the flux on the receiver by its camera; None: not measured.
+        Reference for measuring the flux on the receiver with its camera; None: the flux is not
+        measured.
     twin
-        Address of the simulated field; "" for a real one.
+        Address of the simulated field; "" for a real field.
     """
 
     papers: Papers
@@ -360,7 +363,7 @@ class PlantLinks:
     twin: str = ""
 
     def facts(self) -> dict[str, str]:
-        """Return the last refused connection and the new keys that are not used, by name."""
+        """Return the last refused connection, and the new keys that are not in use, by name."""
         found = {}
         if self.server is not None and self.server.refused:
             told = f"{self.server.last_refusal} ({self.server.refused} so far)"
@@ -472,7 +475,7 @@ def _check_encrypted(path: Path, document: LinksDocument) -> None:
 
 
 def _check_simulated(path: Path, document: LinksDocument) -> None:
-    """Refuse links to real equipment beside a simulated field, whose clock the plant follows."""
+    """Refuse links to real equipment in a plant that follows a simulated field's clock."""
     for name, how in document.clusters.items():
         if how != "tcp":
             raise FormatError(
@@ -497,7 +500,7 @@ def _keyless(path: Path, name: str) -> FormatError:
 
 
 def _listen(path: Path, text: str) -> tuple[str, int]:
-    """Return address and port of ``[tcp].listen``."""
+    """Return the address and the port in ``[tcp].listen``."""
     try:
         parts = urlsplit(f"//{text}")
         host, port = parts.hostname, parts.port

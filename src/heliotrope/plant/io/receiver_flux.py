@@ -74,9 +74,9 @@ def check_reference(design: Plant, reference: ReceiverReference) -> None:
 def flux_by(
     cameras: Cameras, clock: Clock, reference: ReceiverReference, receiver: Receiver
 ) -> "ReceiverFlux":
-    """Return the flux sensor of a receiver, using the plant camera that observes it.
+    """Return the flux sensor of a receiver, which uses the plant camera that observes it.
 
-    It includes a map if the receiver is planar and the camera's pose is known.
+    Its readings include a map if the receiver is planar and the camera's pose is known.
 
     Raises
     ------
@@ -104,7 +104,8 @@ class ReceiverFlux:
     eye
         The camera.
     newest
-        Function that returns its newest frame, or raises a `HeliotropeError` if there is none.
+        Function that returns the camera's newest frame, or raises a `HeliotropeError` if there is
+        none.
     clock
         Clock of the plant.
     reference
@@ -156,7 +157,10 @@ class ReceiverFlux:
         return found
 
     async def _read(self, found: Readings) -> str | None:
-        """Take a reading; return why there is none, empty if there is, None if it is not new."""
+        """Take a reading; return why there is none.
+
+        Returns "" if there is a reading, and None if the frame is not new.
+        """
         frame, who = self._newest(), f"camera {self._eye.name}"
         made = dated(frame, self._eye)
         age = (self._clock.utc() - made).total_seconds()

@@ -1,10 +1,11 @@
 """Sensors: external readings for the safety table and the schedule.
 
-Other programs write them to files, for example.
+For example, other programs write readings to files.
 
-A file contains one number in the unit of its row, and is replaced with each reading (written under
-a temporary name, then renamed). A file that is not replaced yields no new reading; after some
-seconds its row counts the worst case, as if the sensor had failed. See `safety.conditions`.
+A file contains one number, in the unit of the reading's table row, and is replaced with each
+reading (written under a temporary name, then renamed). A file that is not replaced yields no new
+reading; after some seconds the row assumes the worst case, as if the sensor had failed. See
+`safety.conditions`.
 """
 
 import asyncio
@@ -37,10 +38,11 @@ class Readings:
     problems
         Why a reading cannot be read, by reading; "" once it can be read again.
     made
-        When a new value was measured, by reading, monotonic s; now for readings not listed.
+        When a new value was measured, by reading, monotonic s; readings that are not listed were
+        measured now.
     seen
-        For a value measured by a camera: its fraction in the cells of the receiver, (H, W), or on
-        the whole receiver, (); None if the value is only a lower bound.
+        For a value measured by a camera: the flux fractions in the cells of the receiver, (H, W),
+        or on the whole receiver, (); None if the value is only a lower bound.
     """
 
     values: dict[str, float] = field(default_factory=dict)
@@ -50,11 +52,11 @@ class Readings:
 
 
 class Sensors(Protocol):
-    """Sensors that feed readings of the safety table."""
+    """Sensors that supply readings of the safety table."""
 
     @property
     def names(self) -> frozenset[str]:
-        """Readings that they feed."""
+        """Readings that the sensors supply."""
         ...
 
     async def news(self) -> Readings:
@@ -93,7 +95,7 @@ class AllSensors:
 
 
 class SensorFiles:
-    """Sensor files.
+    """Sensors whose readings are in files.
 
     Parameters
     ----------

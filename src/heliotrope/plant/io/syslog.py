@@ -2,10 +2,10 @@
 
 The transports are UDP (RFC 5426), TCP with octet counting (RFC 6587, section 3.4.1) and TLS (RFC
 5425). Messages wait in a bounded queue for a dedicated thread, so a receiver that is slow or
-unreachable delays nothing else. Messages that find the queue full are counted, and the count is
-reported to the receiver and to the plant. A message that TCP had accepted when a connection broke
-may be lost uncounted; the numbers in ``meta sequenceId`` (RFC 5424, section 7.3.1) reveal this to
-the receiver.
+unreachable delays nothing else. Messages that arrive when the queue is full are discarded and
+counted, and the count is reported to the receiver and to the plant. A message that TCP had accepted
+when a connection broke may be lost uncounted; the numbers in ``meta sequenceId`` (RFC 5424, section
+7.3.1) reveal this to the receiver.
 """
 
 import contextlib
@@ -44,7 +44,7 @@ _LAST_NUMBER = 2_147_483_647
 
 @dataclass(frozen=True)
 class Receiver:
-    """Destination of messages: ``udp``, ``tcp`` or ``tls``, host, port, and authority for TLS."""
+    """Destination of messages: transport (``udp``, ``tcp``, ``tls``), host, port, TLS authority."""
 
     scheme: str
     host: str
@@ -62,7 +62,7 @@ class Receiver:
         Raises
         ------
         InputError
-            If it is not a receiver URL, or the authority cannot be used.
+            If the URL is not a receiver URL, or the authority cannot be used.
         """
         try:
             parts = urlsplit(url)
@@ -93,7 +93,7 @@ class _Message:
     text: str
 
     def octets(self, number: int, host: str) -> bytes:
-        """Return the message as RFC 5424, section 6."""
+        """Return the message in the format of RFC 5424, section 6."""
         at = datetime.fromtimestamp(self.at, UTC).isoformat(timespec="milliseconds")
         head = (
             f"<{self.priority}>1 {at.replace('+00:00', 'Z')} {host} heliotrope {os.getpid()} "
@@ -124,7 +124,7 @@ class Syslog:
     lost
         Number of messages for which there was no room in the queue.
     problem
-        Why messages cannot be sent now, empty if they can.
+        Why messages cannot be sent now; "" if they can.
     """
 
     def __init__(self, receiver: Receiver, now: Callable[[], float], most: int = _WAITING) -> None:

@@ -1,4 +1,4 @@
-"""Motion: heliostat paths around keep-out volumes, their proofs, and the monitoring of beams.
+"""Motion: heliostat paths around keep-out volumes, checks of these paths, and beam monitoring.
 
 `PathProofs` proves that a path is clear before it is ordered, and `BeamWatch` then monitors where
 the beams are.

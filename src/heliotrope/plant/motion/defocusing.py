@@ -1,7 +1,7 @@
-"""Where DEFOCUS and STOW lead a beam, and which of them moves it out of a keep-out volume.
+"""Where DEFOCUS and STOW move a beam, and which of the two takes it out of a keep-out volume.
 
 Anyone may issue both orders, and a local controller accepts them in every state, so no command
-authority is needed. The paths are those of a heliostat without a sun vector: a rotation by the
+authority is needed. The paths are the paths of a heliostat without a sun vector: a rotation by the
 defocus angles, or straight to stow, azimuth last.
 """
 
@@ -34,9 +34,9 @@ def order_out(
     aim: FloatArray | None = None,
     standby: FloatArray | None = None,
 ) -> Act:
-    """Return DEFOCUS or STOW: the one whose path ends outside the volumes and rotates less inside.
+    """Return DEFOCUS or STOW, whichever ends outside the volumes with less rotation inside them.
 
-    If the stow position is unknown, it is DEFOCUS.
+    If the stow position is unknown, DEFOCUS is returned.
 
     Parameters
     ----------
@@ -89,8 +89,8 @@ def defocused(
     aims, standbys
         Their points, m, (K, 3); NaN: unknown.
     alike
-        Whether all turn by the smallest defocus angles among them, as if the angles were not
-        spread.
+        Whether all heliostats turn by the smallest defocus angles among them, as if the angles were
+        not spread.
     """
     check, turn = paths.check, paths.defocus[rows]
     begin = paths.angles(rows, counts)
@@ -142,8 +142,8 @@ def defocused_field(
     aims, sun
         ENU, m, (N, 3), and the unit vector to the sun, (3,).
     alike
-        Whether all turn by the smallest defocus angles of the field, as if the angles were not
-        spread.
+        Whether all heliostats turn by the smallest defocus angles of the field, as if the angles
+        were not spread.
     """
     rows = np.arange(len(check.names))
     counts = check.poses(rows, aims, sun).best_counts
@@ -155,7 +155,7 @@ def defocused_field(
 
 
 def _cost(check: BeamCheck, row: int, path: FloatArray, sun: FloatArray) -> tuple[bool, float]:
-    """Return whether a path (K, 2) ends inside a volume, and the rotation made inside, rad."""
+    """Return whether a path (K, 2) ends inside a volume, and its rotation inside volumes, rad."""
     turns = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(path, axis=0)).max(axis=-1))])
     at = np.linspace(0.0, turns[-1], 2 + int(turns[-1] / _PIECE))
     poses = np.stack([np.interp(at, turns, path[:, i]) for i in (0, 1)], axis=-1)

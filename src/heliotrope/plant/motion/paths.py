@@ -1,8 +1,8 @@
 """The path of a beam between two axis positions, and from stow to standby.
 
-The path is that of `lcu.motion`, with the same points, axis order and speeds. When leaving or
-reaching stow, the axes move one after the other; in every other motion both start at once, each at
-its own rate, so that the axis with less to do arrives first.
+The path is the same as in `lcu.motion`, with the same points, axis order and speeds. When leaving
+or reaching stow, the axes move one after the other; in every other motion both start at once, each
+at its own rate, so that the axis with the shorter motion arrives first.
 """
 
 from collections.abc import Callable
@@ -72,7 +72,7 @@ class Paths:
                 self._low[row, i], self._high[row, i] = axis.low, axis.high
 
     def points(self, rows: Rows, standbys: FloatArray) -> tuple[FloatArray, Rows]:
-        """Return the points of the paths to standby points (K, 3), ENU, m.
+        """Return the points along the paths to standby points (K, 3), ENU, m.
 
         Returns
         -------
@@ -112,7 +112,7 @@ class Paths:
             Indices of the heliostats, (K,); steps, (K, 2).
         ramps
             Whether the path covers both curves of a motion from rest to rest: forward at the full
-            rate, and back along the curve with ramps; otherwise only the first.
+            rate, and back along the curve with ramps; otherwise only the forward curve is covered.
         """
         turned = self._turned(rows, begin, end)
         steps, sign, rate = np.abs(turned - begin), np.sign(turned - begin), self._rate[rows]
@@ -135,7 +135,7 @@ class Paths:
         return np.asarray((spans.sum(axis=-1) if turns else spans.max(axis=-1)) + _PAUSE)
 
     def angles(self, rows: Rows, counts: FloatArray) -> FloatArray:
-        """Return the axis angles, rad, at counts; both (K, 2) or (K, W, 2)."""
+        """Return the axis angles at step counts, rad; angles and counts are (K, 2) or (K, W, 2)."""
         table = self.check.drives.table[rows]
         return as_float(Drive(table[:, None] if counts.ndim > 2 else table).angles(counts))
 
@@ -151,7 +151,7 @@ class Paths:
         Parameters
         ----------
         rows
-            Rows of the heliostats, (K,).
+            Indices of the heliostats, (K,).
         begin
             Step counts before the approach, (K, 2).
         standbys
@@ -194,13 +194,16 @@ class Paths:
 
 
 def _time(steps: FloatArray, rate: FloatArray, ramp: FloatArray) -> FloatArray:
-    """Return the duration of (K, 2) steps at rates (steps/s), with a ramp (s) at each end, s."""
+    """Return the time that (K, 2) steps take at given rates, s.
+
+    Rates are in steps/s; a ramp, s, is added at each end.
+    """
     whole = steps >= rate * ramp
     return np.asarray(np.where(whole, steps / rate + ramp, 2.0 * np.sqrt(steps * ramp / rate)))
 
 
 def _bends(steps: FloatArray, rate: FloatArray, ramp: FloatArray) -> FloatArray:
-    """Return instants (M, K, 1), last first, between which motions are nearly straight, s."""
+    """Return instants, s, (M, K, 1), last first, between which motions are nearly straight."""
     last = _time(steps, rate, ramp)
     part = np.minimum(ramp, 0.5 * last) * (np.arange(_PARTS + 1) / _PARTS)[:, None, None]
     times = np.concatenate([part[1:], last - part])
@@ -208,7 +211,7 @@ def _bends(steps: FloatArray, rate: FloatArray, ramp: FloatArray) -> FloatArray:
 
 
 def _gone(time: FloatArray, steps: FloatArray, rate: FloatArray, ramp: FloatArray) -> FloatArray:
-    """Return the steps (..., K, 2) made by times (..., K, 1), s; see `_time`."""
+    """Return the steps (..., K, 2) that have been made at times (..., K, 1), s; see `_time`."""
     last, faster = _time(steps, rate, ramp), rate / ramp
     t, part = np.minimum(time, last), np.minimum(ramp, 0.5 * last)
     even = faster * part * (t - 0.5 * part)

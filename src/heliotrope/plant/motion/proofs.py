@@ -48,7 +48,7 @@ _TO_STANDBY = (
 
 
 class BeamError(RefusedError):
-    """The refusal of a command that would send beams where they are not allowed.
+    """A command is refused because it would send beams where they are not allowed.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class BeamError(RefusedError):
 
 
 class PathProofs:
-    """Proofs that commands bring no beam into a keep-out volume.
+    """Proves that commands bring no beam into a keep-out volume.
 
     Parameters
     ----------
@@ -120,11 +120,11 @@ class PathProofs:
             raise BeamError(name, _refusals(blocked))
 
     def _early(self, name: str, rows: Rows) -> dict[str, str]:
-        """Return the heliostats that may not have a new point before their next report, and why.
+        """Return the heliostats that may not get a new point before their next report, and why.
 
-        The path to the new point is proven clear from the previous point. A heliostat that is still
-        moving to the previous point, or may be because of an order that no report shows yet, would
-        come from elsewhere.
+        The path to the new point was checked from the previous point. A heliostat must wait if it
+        is still moving to the previous point, or may be moving because of an order that no report
+        shows yet, because it would then start from elsewhere.
         """
         if not self._check.volumes:
             return {}
@@ -137,9 +137,9 @@ class PathProofs:
     def _starts(
         self, rows: Rows, tracking: npt.NDArray[np.bool_]
     ) -> list[tuple[FloatArray, npt.NDArray[np.intp]]]:
-        """Return points (M, 3) where the beams of some of K heliostats may be, and which, (M,).
+        """Return points (M, 3) where beams may be, and the heliostat of each point, (M,).
 
-        The first points include all heliostats, with NaN if no point is known.
+        The first K points belong to all K heliostats, with NaN if no point is known.
         """
         points = self.points
         start = np.where(tracking[:, None], points.aims[rows], points.standbys[rows])
@@ -155,12 +155,12 @@ class PathProofs:
     def clear(
         self, name: str, values: Sequence[float], heliostats: tuple[str, ...], now: float
     ) -> tuple[tuple[str, ...], dict[str, str]]:
-        """Return the heliostats that may be sent a command, and why the others may not.
+        """Return the heliostats that may be sent a command, and why the rest may not.
 
         Raises
         ------
         BeamError
-            If no heliostat may.
+            If no heliostat may be sent the command.
         """
         solids = self._check.solids if name == "APPROACH" else ()
         if name not in _PROVEN or not (self._check.volumes or solids):
@@ -197,8 +197,8 @@ class PathProofs:
     def _back_to_standby(self, rows: Rows, now: float) -> dict[str, str]:
         """Return the heliostats whose straight path to standby is blocked, and the reasons.
 
-        A path is proven clear from the pose of a heliostat at rest. A moving heliostat leaves that
-        pose, and does not turn back at once.
+        A path is checked only from the pose of a heliostat at rest. A moving heliostat is refused,
+        because it leaves that pose and does not turn back at once.
         """
         early = self._unsettled(rows) | self._unplaced(rows, now=now)
         rows, blocked = self._resting(rows)
@@ -219,7 +219,7 @@ class PathProofs:
     ) -> dict[str, str]:
         """Return the heliostats (K,) without a report since an order of a kind.
 
-        With ``now`` (monotonic s), heliostats that are not live are included; others wait for them.
+        With ``now`` (monotonic s), heliostats that are not live are included.
         """
         placed = self.ledger.reported(kind)
         if now is not None:
@@ -228,7 +228,7 @@ class PathProofs:
         return {self.field.names[row]: PLACE_UNKNOWN.text for row in late}
 
     def _resting(self, rows: Rows) -> tuple[Rows, dict[str, str]]:
-        """Return the heliostats with known standby points, and why the others do not go."""
+        """Return the heliostats with known standby points, and why the rest may not go."""
         known = np.isfinite(self.points.standbys[rows]).all(axis=-1)
         return rows[known], {
             self.field.names[row]: "the plant does not know its standby point; set one (STANDBY) "
@@ -237,12 +237,12 @@ class PathProofs:
         }
 
     def tables(self, heliostat: str, items: Mapping[str, bytes]) -> tuple[Tables, Tables]:
-        """Return the tables of a heliostat's mechanism now, and after items are stored."""
+        """Return the tables of a heliostat's mechanism before and after items are stored."""
         before = self._tables(self.field.place(heliostat))
         return before, tables_with(items, *before) if POSE_ITEMS.intersection(items) else before
 
     def resting(self, heliostat: str, items: Mapping[str, bytes]) -> str | None:
-        """Return the reason why a heliostat may not rest at the stow position in ``items``."""
+        """Return why a heliostat may not rest at the stow position in ``items``."""
         if "stow" not in items:
             return None
         counts = np.array([struct.unpack(CODES_OF["stow"], items["stow"])], dtype=np.float64)
@@ -252,11 +252,12 @@ class PathProofs:
         return blocked.get(heliostat)
 
     def rewriting(self, heliostat: str, armature: FloatArray, drives: FloatArray) -> str | None:
-        """Return the reason why new parameters may not be written in this pose, or None.
+        """Return why new parameters may not be written in this pose; None if they may.
 
         Under both the present and the new parameters, the beam must be clear in the present pose
         and on the path from there to the standby point. Under the present parameters it must also
-        be clear on the path that the new ones produce, because the new ones may be wrong.
+        be clear on the path that the new parameters produce, because the new parameters may be
+        wrong.
 
         Parameters
         ----------
@@ -280,10 +281,10 @@ class PathProofs:
 
     @contextmanager
     def unverified(self, heliostat: str) -> Iterator[None]:
-        """Check paths with the present parameters too, while new ones are being verified.
+        """Check paths with the present parameters too, while new parameters are being verified.
 
-        The heliostat goes to a target and returns by the replacements. If they are wrong, its beam
-        is where the present parameters predict.
+        The heliostat goes to a target and returns under the new parameters. If these are wrong, its
+        beam is where the present parameters predict.
         """
         row = self.field.place(heliostat)
         self._earlier[row] = self._tables(row)
@@ -293,7 +294,7 @@ class PathProofs:
             self._earlier.pop(row, None)
 
     def misled(self, heliostat: str, point: FloatArray) -> str | None:
-        """Return the reason why unverified parameters block a path to a point (3,), if they do."""
+        """Return why unverified parameters block a path to a point (3,); None if they do not."""
         rows = np.array([self.field.place(heliostat)])
         blocked = self._by_earlier(rows, point[None])
         return blocked[heliostat].partition(";")[0] if blocked else None
@@ -303,7 +304,7 @@ class PathProofs:
 
     @contextmanager
     def _believing(self, row: int, tables: Tables) -> Iterator[None]:
-        """Use other tables for a heliostat within the block."""
+        """Use different mechanism tables for a heliostat within the block."""
         present = self._tables(row)
         self._check.replace(row, *tables)
         try:
@@ -312,7 +313,7 @@ class PathProofs:
             self._check.replace(row, *present)
 
     def _misled(self, rows: Rows, point: FloatArray, tables: Tables) -> dict[str, str]:
-        """Return the reason why the path of one heliostat to a point (1, 3) is blocked.
+        """Return why the path of one heliostat to a point (1, 3) is blocked; None if it is clear.
 
         The heliostat is moved by the parameters of the check, and its beam is computed from
         ``tables``.
@@ -350,8 +351,8 @@ class PathProofs:
     ) -> dict[str, str]:
         """Return the heliostats that may not join their aims now, and the reasons.
 
-        AIM has a new aim in its values; every other command uses the aim that the heliostats may
-        already have.
+        AIM contains a new aim in its values; every other command uses the aim that the heliostats
+        may already have.
         """
         if not self._check.volumes:
             return {}
@@ -377,7 +378,7 @@ class PathProofs:
         return _refusals(reasons)
 
     def _begins(self, rows: Rows) -> list[tuple[npt.NDArray[np.bool_], FloatArray]]:
-        """Return where motions of heliostats may begin: masks of them, (K,), and counts (M, 2).
+        """Return where motions may begin: pairs of a heliostat mask, (K,), and step counts, (M, 2).
 
         A moving heliostat may be anywhere between its counts and its goals.
         """
@@ -393,7 +394,7 @@ class PathProofs:
     def _to_standby(
         self, rows: Rows, standbys: FloatArray, light: FloatArray
     ) -> tuple[Rows, FloatArray]:
-        """Return the heliostats that reach their standby points (K, 3), and their paths there."""
+        """Return the heliostats that can reach their standby points (K, 3), and the paths there."""
         counts = self.field.counts(rows)
         solved = self._check.poses(rows, standbys, light, counts)
         good = solved.chosen(solved.status) == TrackingStatus.OK
@@ -401,7 +402,7 @@ class PathProofs:
         return rows, self.paths.motion(rows, counts[good], ends)
 
     def _by_counts(self, name: str, values: Sequence[float], rows: Rows) -> FloatArray:
-        """Return the angles that a command passes through, from the present pose, (K, W, 2)."""
+        """Return the angles through which a command moves the axes from here, (K, W, 2)."""
         counts = self.field.counts(rows)
         if name == "DIAGNOSE":
             begin = self.paths.angles(rows, counts)
@@ -422,5 +423,5 @@ class PathProofs:
 
 
 def _refusals(reasons: Mapping[str, str]) -> dict[str, str]:
-    """Mark the reasons of heliostats whose paths are not clear; others only await reports."""
+    """Mark the reasons of heliostats whose paths are blocked, as opposed to awaiting a report."""
     return {n: text if text in SOON else NoFreePath(text) for n, text in reasons.items()}

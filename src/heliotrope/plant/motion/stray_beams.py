@@ -1,9 +1,10 @@
-"""Stray beams on a receiver, sent there by no order: from a locked, jogged or defocused heliostat.
+"""Stray beams: beams on a receiver that no order has sent there.
 
-Every heliostat that is neither tracking nor searching is checked, from its step counts and the
-mechanism that the plant believes, because the state alone does not tell where the beam is. A
-heliostat that approaches its goal still counts as moving. A heliostat at stow is checked like all
-others, because the stow position may be wrong.
+They come, for example, from a locked, jogged or defocused heliostat. Every heliostat that is
+neither tracking nor searching is checked, from its step counts and the mechanism that the plant
+believes, because the state alone does not reveal where the beam is. A heliostat that approaches its
+goal still counts as moving. A heliostat at stow is checked like all others, because the stow
+position may be wrong.
 """
 
 from collections.abc import Callable
@@ -62,12 +63,12 @@ class StrayBeams:
         return bool(self._check.solids)
 
     def on_receiver(self, rows: npt.NDArray[np.intp]) -> Mask:
-        """Return a mask of heliostats (K,) with beams on a receiver, by their last counts."""
+        """Return a mask of the heliostats whose last counts put the beam on a receiver, (K,)."""
         drives = Drive(self._check.drives.table[rows])
         return self._check.lights(rows, drives.angles(self._field.counts(rows)), self._sun(0.0))
 
     def check(self, now: float) -> None:
-        """Check the moving heliostats, and some of those at rest."""
+        """Check the moving heliostats, and some of the heliostats at rest."""
         field = self._field
         self._turn = (self._turn + 1) % TURNS
         every = np.arange(len(field))
@@ -85,7 +86,7 @@ class StrayBeams:
         )
 
     def order_out(self, name: str, *, again: bool) -> Act:
-        """Return DEFOCUS, or STOW if DEFOCUS has not helped or would also end on a receiver."""
+        """Return DEFOCUS, or STOW if DEFOCUS has not helped or would end on a receiver as well."""
         row = self._field.place(name)
         if again or self._field.rows["state"][row] in states.LEAVING or self._field.turned[row]:
             return Act.STOW

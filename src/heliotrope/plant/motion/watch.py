@@ -26,7 +26,7 @@ class BeamWatch:
     controller that disobeys, and the motion of the sun, which moves the beam of a heliostat at
     rest. Every heliostat is checked, whatever its state, if its step counts have ever been known;
     if they are unknown or the heliostat is silent, its last reported pose is assumed. Moving
-    heliostats are checked each second, the others in turn.
+    heliostats are checked each second, all other heliostats in turn.
 
     Parameters
     ----------
@@ -51,15 +51,15 @@ class BeamWatch:
 
     @property
     def watched(self) -> frozenset[str]:
-        """Names of the readings, for keep-out volumes and for receivers, if there are any."""
+        """Names of the readings: one each for keep-out volumes and receivers, if there are any."""
         surfaces = {"keep_out_predicted": self._check.volumes, "beam_unsent": self._check.solids}
         return frozenset(name for name, places in surfaces.items() if places)
 
     def readings(self, now: float) -> dict[tuple[str, str], Reading]:
-        """Return 1 for each heliostat whose beam is where it may not be, 0 for others.
+        """Return 1 for each heliostat whose beam is where it may not be, and 0 for the rest.
 
-        This means in a volume or heading for one, or stray on a receiver. The beams are checked
-        once a second; between two checks, the last result counts.
+        Such a beam is in a volume, heading for a volume, or stray on a receiver. The beams are
+        checked once a second; between two checks, the last result counts.
         """
         if now - self._at >= CHECK_PERIOD:
             self._at = now

@@ -1,6 +1,6 @@
 """A running plant, as used by consoles, APIs and the command line.
 
-Begin with `Operations`, the single object that they talk to. Behind it are automatic control
+Begin with `Operations`, the single object that all of them use. Behind it are automatic control
 (`automatic`, with `raising` and `calibrating`), the calibration book, the logbook of alarms, events
 and packets, and `views`, the plain values that are displayed.
 """

@@ -1,9 +1,9 @@
-"""Aims of a plant under a flux limit: computed outside the loop, sent to few heliostats at a time.
+"""Aims of a plant under a flux limit: computed outside the event loop, sent a few at a time.
 
 At regular intervals `heliotrope.aims.rounds` finds the aims with the highest power, and a sequence
-of moves to them that never exceeds the limit. Heliostats receive their aims by the same commands as
-an operator would use, with the same checks. A heliostat at standby joins the receiver only at the
-aim assigned here, and a heliostat without an aim stays at standby. Beams that an operator has
+of moves to them that never exceeds the limit. Heliostats receive their aims through the commands
+that an operator would use, with the same checks. A heliostat at standby joins the receiver only at
+the aim assigned here, and a heliostat without an aim stays at standby. Beams that an operator has
 aimed, or that automatic control may not move, stay where they are, and their flux counts towards
 the limit. If no new aims can be computed, the last good ones stay in force at first. Later the
 field goes to the safe spread: fewer heliostats, at the aims of the plant file.
@@ -11,8 +11,8 @@ field goes to the safe spread: fewer heliostats, at the aims of the plant file.
 With a ramp limit, the flux that the beams would bring in full sun may exceed the flux of the last
 minute only by the rise allowed in one round. Heliostats therefore leave the receiver while a cloud
 covers the sun, and come back in steps. If the measured flux is above the limit, the limit of the
-cells concerned is lowered by the ratio of the measured to the predicted flux, so that the same
-moves relieve them.
+cells concerned is lowered by the ratio of the measured to the predicted flux, so that the usual
+moves reduce their flux.
 """
 
 import asyncio
@@ -74,10 +74,10 @@ class AimsView:
     Attributes
     ----------
     strategy
-        "spread" or "limit"; the other attributes apply to "limit" only.
+        "spread" or "limit"; the remaining attributes apply to "limit" only.
     source
-        Where the present aims come from: "optimiser", "last good aims", "safe spread", "" before
-        the first.
+        Where the present aims come from: "optimiser", "last good aims", "safe spread"; "" before
+        the first aims.
     at
         Age of the last good computation, s; infinite before the first.
     limit, peak
@@ -93,12 +93,12 @@ class AimsView:
     gap
         Upper bound on the fraction of power that better aims could still add.
     aimed, resting, left
-        Number of heliostats with an aim, of wanted heliostats kept at standby by the limit, and of
-        heliostats that still have to move.
+        Number of heliostats with an aim; number of wanted heliostats that the limit keeps at
+        standby; number of heliostats that still have to move.
     moved, moved_ago
-        Number of heliostats in the last move, and time since then, s.
+        Number of heliostats in the last move, and time since that move, s.
     problem
-        Why there are no new aims; empty if there are.
+        Why there are no new aims; "" if there are new aims.
     """
 
     strategy: str
@@ -133,7 +133,7 @@ class Aiming:
     worker
         Runs the computation.
     records
-        Store from which the beams aimed by operators are known after a restart; None: no store.
+        Store that keeps, across restarts, which beams operators have aimed; None: no store.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class Aiming:
     # -- people ----------------------------------------------------------------------------
 
     def by_person(self, heliostats: Sequence[str], *, aimed: bool) -> None:
-        """Note that an operator has aimed heliostats (() for all), or returned them."""
+        """Note that an operator has aimed heliostats (() for all), or has returned them."""
         rows = [self._plant.field.place(name) for name in heliostats or self._plant.field.names]
         if (self._by_person[rows] == aimed).all():
             return
@@ -178,7 +178,7 @@ class Aiming:
                 self._log.take_alarm(alarms.RECORDS.raised(problem=error))
 
     def recall(self) -> None:
-        """Leave alone the beams that operators had aimed when the last program ended."""
+        """Do not move the beams that operators had aimed when the previous program ended."""
         if self._records is None:
             return
         try:
@@ -275,7 +275,7 @@ class Aiming:
                 await self._go(answer.moves)
 
     def _measure(self, answer: Answer, present: Round) -> bool:
-        """Record the flux on the receiver, and how far the measured flux is above the limit.
+        """Record the flux on the receiver, and by how much the measured flux exceeds the limit.
 
         Return whether the flux has only now been measured above the limit, so that the moves of
         this round no longer suffice.
@@ -328,7 +328,7 @@ class Aiming:
         return self._plant.sentinel.table.shown(now).get(DNI_READING, math.nan)
 
     async def _failed(self, problem: str) -> None:
-        """Keep the last good aims; once they are too old, go to the safe spread."""
+        """Keep the last good aims; once these are too old, go to the safe spread."""
         if not self._problem:
             self._log.take_alarm(alarms.AIMS.raised(problem=problem))
         self._problem = problem
@@ -342,7 +342,7 @@ class Aiming:
             await self._to_safe(self._answer.safe)
 
     async def _to_safe(self, safe: FloatArray) -> None:
-        """Go to the safe spread; beams at other aims leave first, so that none overlap."""
+        """Go to the safe spread; beams at other aims leave first, so that beams never overlap."""
         on = self._on(self._plant.now()) & self._movers(self._plant.now())
         apart = ~(np.linalg.norm(self._plant.aims - safe, axis=1) < 0.05)
         rows = np.flatnonzero(on & apart)
@@ -382,7 +382,7 @@ class Aiming:
         return np.array([aims.get(name, none) for name in self._plant.field.names])
 
     def _round(self, now: float) -> Round:
-        """Return the input of a round, and drop what is no longer relevant."""
+        """Return the input of a round; forget records that are no longer relevant."""
         plant, settings = self._plant, self._settings
         assert settings.limit is not None
         on, free, allotted = self._on(now), self._movers(now), self._allotted()
@@ -412,7 +412,7 @@ class Aiming:
         )
 
     def _allowed(self, limit: FluxLimit, scene: Scene) -> FluxLimit:
-        """Return the limit, lowered where a measured flux was above it."""
+        """Return the limit, lowered where a measured flux was above the limit."""
         if not self._beyond:
             return limit
         factor = np.max([beyond.factor for _, beyond in self._beyond], axis=0)
@@ -429,7 +429,7 @@ class Aiming:
         return replace(scene, surfaces=(surface_of(receiver),), mirrors=mirrors, dni=dni)
 
     def _demand(self, limit: FluxLimit) -> Demand:
-        """Return the limit, and the certainty with which it must hold."""
+        """Return the limit, and the probability with which the limit must hold."""
         plant, settings = self._plant, self._settings
         clusters = np.unique(plant.field.cluster, return_inverse=True)[1]
         latitude = math.radians(plant.design.site.latitude_deg)

@@ -81,14 +81,14 @@ class WaitingChange:
 
     @property
     def text(self) -> str:
-        """What it changes, and why, in words."""
+        """What the change sets, and why, in words."""
         what = ", ".join(f"{parameter.name} {parameter.asked:g}" for parameter in self.parameters)
         again = f"back to version {self.version}: " if self.version else ""
         return f"PARAMETERS {self.heliostat}: {again}{what} ({self.reason})"
 
 
 class _Course:
-    """The course of a change, which its author's ticket follows."""
+    """The progress of a change, which its author's ticket tracks."""
 
     def __init__(self, change: WaitingChange) -> None:
         self.change, self.approver = change, ""
@@ -111,7 +111,7 @@ class _Course:
 
 
 class Approvals:
-    """The changes that wait for approval.
+    """Manages the changes that wait for approval.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ class Approvals:
     async def approve(self, person: Person, number: int) -> Ticket:
         """Approve another engineer's change and write it; return the ticket for writing it.
 
-        The author's command authority is used, or else the approver's.
+        The change is written with the author's command authority or, failing that, the approver's.
 
         Raises
         ------
@@ -316,7 +316,7 @@ class Approvals:
         )
 
     def _others(self, person: Person, number: int) -> WaitingChange:
-        """Return a change of another person on which an engineer may decide."""
+        """Return another person's change on which an engineer may decide."""
         person.must_be(Role.ENGINEER, "approval")
         change = self._find(number)
         if person.name == change.author:
@@ -336,7 +336,7 @@ class Approvals:
         return self._courses[number].change
 
     def _over(self, change: WaitingChange) -> str:
-        """Return the reason why a change can no longer wait, or an empty text."""
+        """Return why a change can no longer wait; "" if it can."""
         if self._now() >= change.until:
             return f"nobody approved it by {_utc(change.until)}"
         if (version := self._version(change.heliostat)) != change.based_on:

@@ -3,8 +3,8 @@
 It commands under its own name. It takes the command authority while nobody else holds it, and
 yields at once: it starts nothing new, and visits in progress are completed. It moves only *wanted*
 heliostats. A heliostat that an operator stows, defocuses or locks is not wanted until an operator
-gives it back; after an emergency, none is. After the loss of a large number of heliostats it waits
-for an operator (`losses`).
+gives it back; after an emergency, no heliostat is wanted. After the loss of a large number of
+heliostats it waits for an operator (`losses`).
 """
 
 import asyncio
@@ -103,12 +103,13 @@ class AutomaticSettings:
     Attributes
     ----------
     wanted
-        Whether all heliostats are wanted from the start; otherwise only those that `give_back`
-        names.
+        Whether all heliostats are wanted from the start; otherwise only heliostats passed to
+        `give_back`.
     calibrate
         Whether calibration is switched on at the start.
     rate
-        Number of heliostats that leave stow, and that go to the receiver, per second.
+        Number of heliostats that leave stow per second; the same number may go to the receiver per
+        second.
     beat
         Time between checks of the field, s.
     lowest
@@ -118,8 +119,8 @@ class AutomaticSettings:
     margin
         Clearance of an uncalibrated beam from the targets, standard deviations.
     losses
-        Number of heliostats that may be lost within 30 s; after more, it waits for an operator's
-        Resume.
+        Number of heliostats that may be lost within 30 s; after a larger loss, automatic control
+        waits for an operator's Resume.
     losses_share
         Fraction of the field that may be lost within 30 s, if that is fewer: in a small field the
         above number may be most of the field.
@@ -289,7 +290,7 @@ class AutomaticControl:
     def hold(
         self, person: Person, places: Sequence[tuple[Kind, str]], reason: str, hours: float
     ) -> tuple[str, ...]:
-        """Lock objects for a person; return the heliostats that stow. See `Operations.hold`."""
+        """Lock objects for a person; return the heliostats sent to stow. See `Operations.hold`."""
         names = self.service.take(person, places, reason, hours)
         self._withdraw(names, f"{person.name} took it out of service")
         return names
@@ -350,7 +351,7 @@ class AutomaticControl:
             self._calibrating.ask(heliostat, target, search=search)
 
     def _check_calibration(self, heliostats: Sequence[str]) -> None:
-        """Refuse a calibration that cannot be made; one that must wait a little is accepted."""
+        """Refuse a calibration that cannot be made; accept it if it must only wait a little."""
         idle, wanted = self._why_not(), self._raising.wanted
         for name in heliostats:
             why = "" if idle == _STARTING else idle
@@ -360,7 +361,7 @@ class AutomaticControl:
                 raise refusals.NO_CALIBRATION.error(heliostat=name, why=why)
 
     def _locked(self, heliostats: Sequence[str]) -> list[str | None]:
-        """Return the locks that keep heliostats from their aims, in words; None without a lock."""
+        """Return in words the locks that keep heliostats from their aims; None if none do."""
         aims = self._plant.aims[[self._plant.field.place(name) for name in heliostats]]
         return self._plant.lockouts.reasons(heliostats, aims)
 
@@ -409,7 +410,7 @@ class AutomaticControl:
     def _up_step(self, name: str, state: int, age: float, waits: str, *, able: bool) -> Step:
         """Return the step of a heliostat that automatic control may move.
 
-        ``waits`` is what it waits for apart from its turn, "" for nothing.
+        ``waits`` is what the heliostat waits for, apart from its turn; "" if for nothing.
         """
         shown = self._plant.field.of(name, self._plant.now())
         if not shown.live:
@@ -437,7 +438,7 @@ class AutomaticControl:
         return heliostat in self._raising.uncalibrated((heliostat,))
 
     def visit_of(self, heliostat: str) -> Running | None:
-        """Return the visit of a heliostat that is in progress, None if there is none."""
+        """Return the visit of a heliostat that is in progress; None if there is none."""
         running = () if self._calibrating is None else self._calibrating.running.values()
         return next((one for one in running if heliostat in one.heliostats), None)
 
@@ -481,18 +482,18 @@ class AutomaticControl:
 
     @property
     def waits(self) -> str:
-        """Why it waits for an operator's Resume, empty if it does not."""
+        """Why automatic control waits for an operator's Resume; "" if it does not wait."""
         return self._losses.reason
 
     @property
     def to_resume(self) -> str:
-        """What an operator's Resume would do, empty if nothing waits for it."""
+        """What an operator's Resume would do; "" if nothing waits for a Resume."""
         left = 0 if self._plant.sentinel.on else int(self._raising.left.sum())
         after = f"The emergency is over: {left:,} heliostats wait until an operator presses Resume."
         return self.waits or (after if left else "")
 
     def left_by_emergency(self, heliostat: str) -> bool:
-        """Return whether an emergency has removed a heliostat, without a Resume since."""
+        """Return whether an emergency has removed a heliostat and no Resume has followed."""
         return bool(self._raising.left[self._plant.field.place(heliostat)])
 
     def resume(self) -> int:
@@ -548,7 +549,7 @@ class AutomaticControl:
 
     @property
     def idle(self) -> str:
-        """Why nothing is moved now, empty if heliostats may be moved."""
+        """Why nothing is moved now; "" if heliostats may be moved."""
         return self._why_idle() or ""
 
     def movable(self) -> npt.NDArray[np.bool_]:
@@ -561,7 +562,7 @@ class AutomaticControl:
         return self._visiting()
 
     def move(self, points: Mapping[str, FloatArray]) -> Ticket:
-        """Aim tracking heliostats at other points, ENU, m, (3,); see `PlantController.aim`."""
+        """Aim tracking heliostats at new points, ENU, m, (3,); see `PlantController.aim`."""
         return self._plant.aim(AUTOMATIC, self._token, points)
 
     def rest(self, heliostats: Sequence[str]) -> Ticket:
@@ -615,7 +616,7 @@ class AutomaticControl:
                 group.create_task(self._again("prediction", look, POINT_EVERY))
 
     async def _again(self, name: str, part: Callable[[], Awaitable[None]], pause: float) -> None:
-        """Repeat a part of the work; a failure raises an alarm and ends nothing."""
+        """Repeat a part of the work; a failure raises an alarm, but does not end the repetition."""
         refused = ""
         # A cancelled visit brings its beam home, and may then end with another error.
         while not self._stopped:
@@ -646,7 +647,7 @@ class AutomaticControl:
         return grant is not None and grant.holder == AUTOMATIC and grant.token == self._token
 
     def _why_not(self) -> str | None:
-        """Return the reason why nothing is calibrated now, None if calibration may run."""
+        """Return why nothing is calibrated now; None if calibration may run."""
         if self._calibrating is None:
             return "there is no camera"
         if not self._on:
@@ -654,7 +655,7 @@ class AutomaticControl:
         return self._why_idle()
 
     def _why_idle(self) -> str | None:
-        """Return the reason why nothing is moved now, None if heliostats may be moved."""
+        """Return why nothing is moved now; None if heliostats may be moved."""
         if self._plant.sentinel.on:
             return "an emergency is active"
         if self.waits:
@@ -671,7 +672,10 @@ class AutomaticControl:
         return None
 
     async def _govern(self) -> None:
-        """Hold the authority while nobody else wants it; give up in an emergency and at night."""
+        """Hold the command authority while nobody else wants it.
+
+        Automatic control gives it up in an emergency and at night.
+        """
         plant, wanted = self._plant, self._raising.wanted
         if plant.sentinel.on:
             self._raising.give_up()
@@ -683,7 +687,7 @@ class AutomaticControl:
         self._night()
 
     def _night(self) -> None:
-        """Stow the wanted heliostats before the sun is low, and any found out of stow later."""
+        """Stow the wanted heliostats before the sun is low, and later any found out of stow."""
         now = self._plant.now()
         if now - self._sun_at < _SUN_EVERY:
             return
@@ -704,7 +708,7 @@ class AutomaticControl:
             self._log.event("plant", AUTOMATIC.name, "the sun is high enough")
 
     def _stow_up(self, *, told: bool) -> None:
-        """Stow the wanted heliostats that are up; with ``told``, report it even if none is."""
+        """Stow the wanted heliostats that are up; with ``told``, report this even if none is up."""
         up = self._plant.field.among(states.UP, self._plant.now()) & self._raising.wanted
         names = tuple(self._plant.field.names[row] for row in np.flatnonzero(up))
         if names:
@@ -728,17 +732,17 @@ class AutomaticControl:
             await self._raising.step(self._token, self._visiting, resting)
 
     def _left_alone(self) -> npt.NDArray[np.bool_]:
-        """Return a mask of the heliostats that automatic control leaves where they are, (N,)."""
+        """Return a mask of the heliostats that automatic control does not move, (N,)."""
         return self._losses.settling() | self.service.rows() | self._raising.given_up()
 
     async def _diagnose(self) -> None:
-        """Check daily, before heliostats are raised, that their drives move the mirrors."""
+        """Check every day, before heliostats are raised, that their drives move the mirrors."""
         if not self._why_idle():
             free = self._raising.wanted & ~self._left_alone()
             await self._checks.step(self._token, free)
 
     def _start_again(self, rows: npt.NDArray[np.intp]) -> None:
-        """Stow heliostats that cannot proceed from where they are; they are then raised again."""
+        """Stow heliostats that cannot proceed from their present pose, to raise them again."""
         if len(rows):
             names = tuple(self._plant.field.names[row] for row in rows)
             self._plant.stow(AUTOMATIC.name, names)

@@ -18,7 +18,7 @@ _HEAD = struct.calcsize(BUS_ENTRY)
 
 
 async def record(plant: PlantController, cluster: str) -> tuple[BusFrame, ...]:
-    """Record the frames of a cluster's bus for five seconds; return them, the oldest first.
+    """Record the frames of a cluster's bus for five seconds; return them, oldest first.
 
     They are decoded in a thread, because hundreds of frames take tens of milliseconds, which would
     delay leases.
@@ -28,7 +28,7 @@ async def record(plant: PlantController, cluster: str) -> tuple[BusFrame, ...]:
     UnknownNameError
         If there is no such cluster.
     RefusedError
-        If the cluster records nothing.
+        If the cluster does not record frames.
     """
     answer = await plant.ask_cluster(cluster, "frames", PATIENCE)
     if answer is None:
@@ -52,7 +52,7 @@ def decoded(answer: Answer) -> tuple[BusFrame, ...]:
     Raises
     ------
     ValueError
-        If the reply is truncated; other decoding errors if it is damaged in another way.
+        If the reply is truncated. Other decoding errors are raised if it is damaged in another way.
     """
     begin, names = float(answer.data["utc_s"]), dict(answer.data["names"])
     if not math.isfinite(begin):

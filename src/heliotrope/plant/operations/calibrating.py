@@ -57,22 +57,22 @@ class Scheduling(Foreseeing, Protocol):
     Attributes
     ----------
     attempts
-        Failed visits, by heliostat; in POSIX s.
+        Failed visits, by heliostat; times in POSIX s.
     """
 
     attempts: Attempts
 
     @property
     def reason(self) -> str:
-        """Why the last choice was made, or why there was none; "" before the first."""
+        """Why the last visit was chosen, or why none was; "" before the first choice."""
         ...
 
     def next(
         self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False
     ) -> PlannedVisit | None:
-        """Return the next of the ready heliostats (N,) for a free target, None if none is due.
+        """Return the next of the ready heliostats (N,) for a free target; None if none is due.
 
-        With ``beside``, the heliostat joins the visit of those returned before.
+        With ``beside``, the heliostat joins the visit of the heliostats returned by earlier calls.
         """
         ...
 
@@ -115,7 +115,7 @@ class Visits:
 
 
 class TrueErrors:
-    """True tracking errors, known to a twin only, computed every five seconds.
+    """True tracking errors, known only to a twin, and computed every five seconds.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ class Calibrating:
         Function that returns the heliostats to be visited first, after the doubtful ones.
     ruled
         Function that returns a mask of the heliostats under a timetable rule, (N,); None: there are
-        none.
+        no rules.
     """
 
     def __init__(
@@ -211,7 +211,7 @@ class Calibrating:
         return tuple(each.requests for each in (self._joint, self._receiver) if each is not None)
 
     def ask(self, heliostat: str, target: str, *, search: bool = False) -> None:
-        """Calibrate a heliostat before all others, on a target or, if "", on the next free one.
+        """Calibrate a heliostat before all others, on a target ("": the next free target).
 
         With ``search``, its beam is only searched for.
         """
@@ -219,7 +219,7 @@ class Calibrating:
         self._asked[heliostat] = target, search
 
     def _forget(self, heliostats: Sequence[str]) -> None:
-        """Forget why earlier requests for heliostats were dropped."""
+        """Forget the reasons why earlier requests for heliostats were dropped."""
         for name in heliostats:
             self._withdrawn.pop(name, None)
 
@@ -230,7 +230,7 @@ class Calibrating:
 
     @property
     def receiver(self) -> str:
-        """Name of the receiver on which heliostats are measured; empty if none is."""
+        """Name of the receiver on which heliostats are measured; "" if there is none."""
         return "" if self._receiver is None else self._receiver.surface
 
     def ask_together(self, heliostats: Sequence[str], surface: str) -> None:
@@ -264,7 +264,7 @@ class Calibrating:
         return {place: run for place, run in present if run is not None}
 
     def result(self, heliostat: str, since: float) -> CalibrationEntry | str:
-        """Return the result of a visit that ended since a time, POSIX s, or why there is none."""
+        """Return the result of a visit that ended after a time, POSIX s, or why there is none."""
         found, why = self._last.get(heliostat), self._withdrawn.get(heliostat)
         if why is None and found is not None and found.at >= since:
             return found
@@ -282,15 +282,15 @@ class Calibrating:
 
     @property
     def choice(self) -> str:
-        """Why the last visit was chosen, or why there was none; "" before the first."""
+        """Why the last visit was chosen, or why none was; "" before the first choice."""
         return self._scheduler.reason
 
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> tuple[PlannedVisit, ...]:
-        """Return the coming visits of the ready heliostats, (N,)."""
+        """Return the next planned visits of the ready heliostats, (N,)."""
         return tuple(self._scheduler.plan(self._chooses(ready), limit))
 
     def _chooses(self, ready: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-        """Return a mask of the ready heliostats that the schedule may choose itself, (N,)."""
+        """Return a mask of the ready heliostats that the schedule itself may choose, (N,)."""
         return np.asarray(ready & ~self._ruled("never"))
 
     async def visit(
@@ -299,9 +299,9 @@ class Calibrating:
         """Calibrate the next of the ready heliostats (N,), or several together; return which.
 
         Heliostats requested by operators come first, then heliostats with doubtful step counts,
-        because a photograph resolves the doubt. Then come those for which a flight has brought a
-        large change, which a photograph confirms. A heliostat that was on a target a moment ago
-        comes after all others.
+        because a photograph resolves the doubt, then heliostats for which a flight has brought a
+        large change, because a photograph confirms the change. A heliostat that was on a target a
+        moment ago comes after all others.
         """
         if not self.asked and not self._places.due(target, self._plant.now()):
             return ()
@@ -347,7 +347,7 @@ class Calibrating:
     async def _for_joint_visit(
         self, joint: JointVisits, target: str, ready: npt.NDArray[np.bool_]
     ) -> tuple[str, ...]:
-        """Return the heliostats of a joint visit; () if the next visit is a single one."""
+        """Return the heliostats of a joint visit; () if a single heliostat comes next."""
         if names := joint.requests.next(target, ready):
             return names
         alone = any(
@@ -370,7 +370,7 @@ class Calibrating:
     async def receiver_visit(
         self, ready: npt.NDArray[np.bool_], person: Person, token: int
     ) -> tuple[str, ...]:
-        """Calibrate the ready heliostats (N,) that are due on the receiver; return which.
+        """Calibrate on the receiver those of the ready heliostats (N,) that are due; return which.
 
         A heliostat with a doubtful result is measured on a target next.
         """
@@ -450,14 +450,20 @@ class Calibrating:
         return self._plant.sentinel.on or grant is None or grant.token != token
 
     def _note_place(self, place: str, problem: str, token: int) -> None:
-        """Note why a visit failed through no fault of a heliostat, empty if it did not."""
+        """Record why a visit to a place failed through no fault of a heliostat.
+
+        ``problem`` is "" if the visit did not fail in this way.
+        """
         if not problem:
             self._places.done(place)
         elif not self._interrupted(token):
             self._places.failed(place, problem, self._plant.now())
 
     def _pressing(self) -> npt.NDArray[np.bool_]:
-        """Return a mask of heliostats in doubt or changed by a flight, (N,), which go alone."""
+        """Return a mask of the heliostats that need a photograph of their own, (N,).
+
+        They are in doubt, or a flight has changed them, so they visit a target alone.
+        """
         first = frozenset(self._first())
         # A flight brings new knowledge about heliostats that were given up.
         self._scheduler.attempts.renew(first - self._flown)
@@ -466,7 +472,7 @@ class Calibrating:
         return np.asarray(self._plant.doubtful.standing | changed)
 
     def _chosen(self, target: str, ready: npt.NDArray[np.bool_]) -> tuple[str, bool]:
-        """Return the heliostat, and whether its beam is only searched for."""
+        """Return the heliostat chosen, and whether its beam is only searched for."""
         for name, (where, search) in self._asked.items():
             if where in ("", target) and ready[self._plant.field.place(name)]:
                 del self._asked[name]
@@ -484,7 +490,7 @@ class Calibrating:
         return self._witness(fresh), False
 
     def _witness(self, ready: npt.NDArray[np.bool_]) -> str:
-        """Return a heliostat (N,) whose photographs show the sun direction, if one is needed."""
+        """Return a heliostat whose photographs would show the sun direction; "" if not needed."""
         plant = self._plant
         if not plant.witnesses.awaits_photographs:
             return ""

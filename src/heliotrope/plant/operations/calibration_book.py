@@ -26,7 +26,7 @@ _NO_FAILURE = (CalibrationOutcome.UNCHANGED, CalibrationOutcome.TAKEN_OUT)
 
 
 class CalibrationBook:
-    """Calibration of N heliostats, from the calibrations that the plant believes.
+    """Records of the calibration of N heliostats, from the calibrations that the plant believes.
 
     Parameters
     ----------
@@ -38,15 +38,15 @@ class CalibrationBook:
     Attributes
     ----------
     error
-        Predicted standard deviation of the normal (two-dimensional) at the aim, rad, (N,). It
-        grows with the time since the calibration.
+        Predicted standard deviation of the mirror normal (two-dimensional) at the aim, rad, (N,).
+        It grows with the time since the calibration.
     spread
         Covariance of the beam behind ``error``, to the right of and above the aim as seen from the
         mirror, rad², (N, 2, 2); NaN before the first calibration.
     measured, calibrated_at, sightings
         See `FieldFrame`.
     results, quality
-        The last results and the last points of the quality, oldest first.
+        The last results, and the last points of the field's quality over time, oldest first.
     failed
         Number of visits without a new calibration.
     """
@@ -129,7 +129,7 @@ class CalibrationBook:
     def error_on(self, target: Target, rows: npt.NDArray[np.intp]) -> FloatArray:
         """Return the expected errors of n beams on a target now, rad RMS (2-D), (n,).
 
-        NaN for heliostats without a calibration, and while the sun is down.
+        The error is NaN for heliostats without a calibration, and for all while the sun is down.
         """
         if self._dark:
             return np.full(len(rows), np.nan)
@@ -194,7 +194,7 @@ class CalibrationBook:
 
 
 def _shares(values: FloatArray) -> tuple[float, float]:
-    """Return median and 90th percentile of the finite values."""
+    """Return the median and the 90th percentile of the finite values."""
     good = values[np.isfinite(values)]
     if not len(good):
         return float("nan"), float("nan")

@@ -66,7 +66,7 @@ class Requests:
     Parameters
     ----------
     place
-        Function that returns the row of a heliostat.
+        Function that returns the index of a heliostat.
     """
 
     def __init__(self, place: Callable[[str], int]) -> None:
@@ -75,11 +75,11 @@ class Requests:
 
     @property
     def asked(self) -> tuple[str, ...]:
-        """The heliostats."""
+        """The requested heliostats."""
         return tuple(name for names, _ in self._asked for name in names)
 
     def ask(self, heliostats: Sequence[str], surface: str) -> None:
-        """Request a common measurement on a surface or, if "", on the next free one."""
+        """Request a joint measurement on a surface ("": the next free surface)."""
         self._asked.append((tuple(dict.fromkeys(heliostats)), surface))
 
     def withdraw(self, heliostats: Collection[str]) -> None:
@@ -88,7 +88,7 @@ class Requests:
         self._asked = [(names, surface) for names, surface in left if names]
 
     def next(self, surface: str, ready: Mask) -> tuple[str, ...]:
-        """Return the next group for a surface, once all of it is ready (N,); () if none is."""
+        """Return the next group for a surface, once all its heliostats are ready; () if none is."""
         for i, (names, where) in enumerate(self._asked):
             if where in ("", surface) and ready[[self._place(name) for name in names]].all():
                 del self._asked[i]
@@ -133,11 +133,11 @@ class JointVisits:
         self._choosing = asyncio.Lock()
 
     async def chosen(self, target: str, ready: Mask, following: Next) -> tuple[str, ...]:
-        """Return the ready heliostats (N,) that go to a target together; () if too few would.
+        """Return the ready heliostats (N,) that go to a target together; () if there are too few.
 
-        Heliostats that were never calibrated, or are poorly known, come first; then those that are
-        due. While others wait for their first calibration, at most every second visit to a target
-        is a joint visit.
+        Heliostats that were never calibrated, or are poorly known, come first; heliostats that are
+        due come next. While heliostats wait for their first calibration, at most every second visit
+        to a target is a joint visit.
         """
         settings, able = self.cycle.settings, ready & ~self.alone(ready)
         first = ready & ~np.isfinite(self._book.calibrated_at)
@@ -165,9 +165,9 @@ class JointVisits:
         return names if len(names) >= settings.least else ()
 
     async def _error_on(self, target: str, heliostats: Mask) -> FloatArray:
-        """Return the expected errors of beams on a target, as a joint visit judges them, rad, (N,).
+        """Return the beam errors that a joint visit to a target expects, rad, (N,).
 
-        The error at the place of the visit counts, because sightings on one target leave a larger
+        The error at the place of the visit is used, because sightings on one target leave a larger
         error on the receiver.
         """
         again, place = 2.0 * self.cycle.settings.visit**2, self._plant.design.target(target)
@@ -196,7 +196,7 @@ class JointVisits:
         return tuple(names)
 
     def alone(self, ready: Mask) -> Mask:
-        """Return a mask of the ready heliostats (N,) that joint visits gave up; they go alone."""
+        """Return a mask of the ready heliostats that joint visits gave up, (N,); they go alone."""
         found = np.zeros_like(ready)
         found[[self._plant.field.place(name) for name in self.cycle.attempts.given_up]] = True
         return found & ready
@@ -204,7 +204,7 @@ class JointVisits:
     def awaited(self, target: str, ready: Mask) -> bool:
         """Return whether a target waits for more heliostats, because few have been raised yet.
 
-        It waits for at most `_PATIENCE`, once, for a joint first visit that is worthwhile.
+        A target waits only once, for at most `_PATIENCE`, for a worthwhile joint first visit.
         """
         settings, now = self.cycle.settings, self._plant.now()
         full = settings.first * len(self._plant.design.targets)
@@ -223,11 +223,11 @@ class JointVisits:
         self._last.add(target)
 
     def again(self, result: CycleResult) -> bool:
-        """Return whether a result is no failure because another joint visit will search again."""
+        """Return whether another joint visit will search for the beam, so this one did not fail."""
         return result.verdict is not None and self.cycle.searching(result.heliostat)
 
     def concluded(self, result: CycleResult) -> None:
-        """Note the result of a visit: what it proves or disproves about a heliostat."""
+        """Note the result of a visit; raise or end the alarm that a beam is not as predicted."""
         self.cycle.note(result)
         name, kind = result.heliostat, alarms.BEAM_DISPROVED
         # Nothing predicts where the beam of an uncalibrated heliostat should be.
@@ -261,7 +261,7 @@ class ReceiverVisits:
     attempts
         Visits without a result, by receiver.
     mirrors
-        Visits from which a heliostat was left out, by heliostat.
+        Visits that left out a heliostat, by heliostat.
     """
 
     def __init__(
@@ -295,7 +295,7 @@ class ReceiverVisits:
     def chosen(self, ready: Mask) -> tuple[str, ...]:
         """Return the ready heliostats (N,) that are measured next; () if there are too few.
 
-        Heliostats requested by operators come first, then those whose errors may be largest.
+        Heliostats requested by operators come first, then heliostats whose errors may be largest.
         """
         field, settings, now = self._plant.field, self._settings, self._plant.now()
         lit = ready & self._shining()
@@ -318,9 +318,9 @@ class ReceiverVisits:
     def concluded(self, results: Sequence[CycleResult]) -> tuple[str, ...]:
         """Note a visit's results; return the heliostats to measure on a target.
 
-        If fewer than half of the heliostats are measured, the light is to blame and not the
-        heliostats. A heliostat that failed too often while others were measured also goes to a
-        target.
+        If fewer than half of the heliostats are measured, the light is assumed to be the cause, not
+        the heliostats. A heliostat that failed too often while other heliostats were measured also
+        goes to a target.
         """
         results = [r for r in results if r.outcome is not CalibrationOutcome.TAKEN_OUT]
         now, seen = self._plant.now(), [r.heliostat for r in results if r.verdict is None]

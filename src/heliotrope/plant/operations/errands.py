@@ -1,8 +1,8 @@
 """Errands: operations that involve several commands, followed to their result.
 
 An operator requests a calibration, takes a heliostat out of service, or gives it to automatic
-control. Each of these is a `Ticket` too: it states what each heliostat is doing or waiting for, and
-ends with the result, or with the reason why there is none.
+control. Each of these operations also has a `Ticket`, which states what each heliostat is doing or
+waiting for, and which ends with the result, or with the reason why there is none.
 """
 
 import math
@@ -17,7 +17,7 @@ from heliotrope.plant.orders.tickets import Ticket
 
 @dataclass(frozen=True)
 class Step:
-    """Progress of an operation for a heliostat: in words, and its stage; None: still waiting."""
+    """Progress of an operation for a heliostat: text and stage; a stage of None: still waiting."""
 
     text: str
     stage: Stage | None = None
@@ -29,7 +29,7 @@ Progress = Callable[[Sequence[str]], Mapping[str, Step]]
 
 @dataclass(frozen=True)
 class _Errand:
-    """An operation in progress: its ticket, its time limit, and what to call if it is given up."""
+    """An operation in progress: its ticket, its time limit, and a function to call on giving up."""
 
     ticket: Ticket
     progress: Progress

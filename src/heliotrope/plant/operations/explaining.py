@@ -18,7 +18,7 @@ _Case = tuple[str, str, str, Button]
 def explain(
     plant: PlantController, automatic: AutomaticControl, logbook: Logbook, name: str, on: str
 ) -> Explanation:
-    """Explain one heliostat.
+    """Explain why a heliostat tracks or not.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def explain(
     name
         Heliostat.
     on
-        Receiver or target at which it aims, "" for none.
+        Receiver or target at which the heliostat aims; "" if there is none.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def _case(
     *,
     tracks: bool,
 ) -> _Case:
-    """Return the first applicable reason among those that take precedence over all others."""
+    """Return the first applicable reason among the reasons that take precedence over all others."""
     name = shown.name
     if held := plant.lockouts.text(Kind.HELIOSTAT, name):
         return (

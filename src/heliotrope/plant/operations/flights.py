@@ -1,10 +1,10 @@
 """Import of drone flights: all heliostats fitted together, new parameters applied safely.
 
 A flight never moves a beam. A small change is applied while the heliostat is at stow or locked,
-where its local controller may be written. A large change, and a first calibration, wait for a visit
-to a target, which fits the records of the flight together with its photographs and verifies the
-result by one more photograph. Until then a heliostat that the flight found far from its expected
-pose stays off the receiver.
+because then its local controller may be written to. A large change, and a first calibration, wait
+for a visit to a target, which fits the records of the flight together with its photographs and
+verifies the result by one more photograph. Until then a heliostat that the flight found far from
+its expected pose stays off the receiver.
 """
 
 import asyncio
@@ -57,7 +57,7 @@ class _Way(Enum):
 class _Waiting:
     """A heliostat with the fit from a flight, and the version with which the fit was compared.
 
-    ``astray``: the flight observed it far from where its parameters predict.
+    ``astray``: the flight observed the heliostat far from where its parameters place it.
     """
 
     way: _Way
@@ -119,7 +119,7 @@ class FlightIntake:
         return self._conclude(taken, flights, fits, text)
 
     def take_now(self, person: Person, document: FlightDocument, text: str) -> FlightView:
-        """Import a flight within the caller's thread, as `take` does."""
+        """Import a flight as `take` does, but within the caller's thread."""
         flight = self._checked(person, document)
         taken = TakenFlight(
             flight, np.zeros(len(flight.sightings), np.int64), self._utc(), person.name
@@ -164,7 +164,7 @@ class FlightIntake:
     def _conclude(
         self, taken: TakenFlight, flights: Flights, fits: Mapping[str, JudgedFit], text: str
     ) -> FlightView:
-        """Adopt a flight that does not contradict the field; sort its heliostats."""
+        """Adopt a flight that does not contradict the field; decide what its heliostats do."""
         flight, wrong = taken.flight, [n for n, f in fits.items() if f.outcome in WRONG]
         if len(wrong) > _MOST_WRONG * len(fits):
             first = f"{wrong[0]}: {fits[wrong[0]].problem}"
@@ -209,7 +209,7 @@ class FlightIntake:
     # -- afterwards ------------------------------------------------------------------------
 
     def recall(self) -> None:
-        """Repeat the fits of flights from before a restart; those that were waiting wait again."""
+        """Repeat the fits of flights from before a restart; fits that were waiting wait again."""
         beliefs, fits = self._plant.beliefs, dict[str, JudgedFit]()
         known, beliefs.flights = tuple(beliefs.flights), Flights()
         for taken in known:

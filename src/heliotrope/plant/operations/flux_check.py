@@ -1,7 +1,8 @@
-r"""The flux that is measured on the receiver, compared with the predicted one.
+r"""Compares the flux measured on the receiver with the predicted flux.
 
-A camera gives a map, a calorimeter or flux sensor one number; both are fractions of the receiver's
-nominal power. With the measured flux $M_c$ and the predicted $F_c$ in the cells that were measured,
+A camera measures a map, a calorimeter or flux sensor a single number; both are fractions of the
+receiver's nominal power. With the measured flux $M_c$ and the predicted $F_c$ in the cells that
+were measured,
 
 $$D^2 = \sum_c (M_c - F_c)^2 / \sum_c σ_c^2$$
 
@@ -9,9 +10,9 @@ $$σ_c^2 = s_c^2 + (a^2 + e^2) F_c^2 + (b F_\text{peak})^2 + (f F_\text{nominal}
 
 where s_c is the standard deviation due to the calibration errors. D² has an expected value of 1 if
 the standard deviations are right, for any number of cells and any correlation of their errors. This
-measure is our own. `SCALE` (a) covers irradiance, reflectivity and soiling, `SHAPE` (b, of maps)
-for the mirrors' figure, `READ` and `FLOOR` (e, f) for the measurement (from rendered frames, see
-*how to use cameras*).
+measure is our own. `SCALE` (a) covers irradiance, reflectivity and soiling; `SHAPE` (b, for maps)
+covers the mirrors' figure; `READ` and `FLOOR` (e, f) cover the measurement (from rendered frames,
+see *how to use cameras*).
 
 Where the measured flux is above the flux limit, the prediction was too low, and `beyond` says by
 how much, for `Aiming`. Only a plausible measurement counts: above `TRUST` times the prediction,
@@ -58,9 +59,9 @@ class Beyond:
     Attributes
     ----------
     factor
-        Ratio of the measured flux to the predicted one in the cells where it is above the limit, 1
-        elsewhere, in the order of the limit's cells, (rows, columns); the same in all cells if only
-        the mean was measured.
+        Ratio of the measured to the predicted flux in the cells where the measured flux is above
+        the limit, and 1 elsewhere; in the order of the limit's cells, (rows, columns). If only the
+        mean was measured, the ratio is the same in all cells.
     excess
         Greatest ratio of the measured flux to the limit, less 1.
     """
@@ -70,7 +71,7 @@ class Beyond:
 
 
 def distance(view: PredictedView, measured: FloatArray, mean: float, area: float) -> float:
-    """Return how far a measured flux is from the predicted one, in standard deviations.
+    """Return how far a measured flux is from the predicted flux, in standard deviations.
 
     Parameters
     ----------
@@ -109,8 +110,8 @@ def distance(view: PredictedView, measured: FloatArray, mean: float, area: float
 class FluxCheck:
     """Compares the flux on a plant's receiver with the prediction; alarms if they differ.
 
-    It compares if the plant has one receiver, its nominal power is known, and the irradiance is
-    measured.
+    The comparison is made if the plant has one receiver, its nominal power is known, and the
+    irradiance is measured.
 
     Parameters
     ----------
@@ -138,7 +139,8 @@ class FluxCheck:
     def see(self, fractions: FloatArray | None) -> None:
         """Accept a new measurement: fractions of the nominal mean flux, (H, W) or ().
 
-        None: the camera did not see the whole receiver light, so there is nothing to compare.
+        None means that the camera did not see all the light on the receiver, so there is nothing to
+        compare.
         """
         self._seen = fractions, self._plant.now()
 
@@ -154,7 +156,9 @@ class FluxCheck:
         return as_float(self._mean * share) if math.isfinite(share) else None
 
     def beyond(self, limit: FluxLimit, predicted: FloatArray) -> Beyond | None:
-        """Return how far the measured flux is above a limit without margin; None: it is not.
+        """Return by how much the measured flux exceeds a limit without margin.
+
+        Returns None if the flux is not above the limit.
 
         If only the mean is measured, the predicted map is scaled to it.
 
@@ -191,7 +195,7 @@ class FluxCheck:
         return Beyond(as_float(factor), float((mapped / allowed)[hot].max()) - 1.0)
 
     async def look(self) -> None:
-        """Compare, and raise or end the alarm.
+        """Compare the measured with the predicted flux, and raise or end the alarm.
 
         Raises
         ------

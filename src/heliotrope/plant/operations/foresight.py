@@ -34,7 +34,7 @@ class Prospect(Protocol):
         ...
 
     def outlook(self) -> Outlook | None:
-        """Return the prediction, None if nothing more can be measured on this day."""
+        """Return the prediction; None if nothing more can be measured on this day."""
         ...
 
 
@@ -42,7 +42,7 @@ class Foreseeing(Protocol):
     """The part of the schedule that a prediction needs."""
 
     def foresee(self, able: npt.NDArray[np.bool_], targets: Sequence[str]) -> Prospect | None:
-        """Return the present knowledge; None if it cannot predict.
+        """Return the present knowledge; None if no prediction can be made from it.
 
         Parameters
         ----------
@@ -64,9 +64,9 @@ class Foresight:
     schedule
         Schedule from whose knowledge predictions are made.
     every
-        Time between predictions, s; 0: none is made.
+        Time between predictions, s; 0: no predictions are made.
     worker
-        Computes them.
+        Runs the computation.
 
     Attributes
     ----------
@@ -103,12 +103,12 @@ class Foresight:
     async def look(
         self, able: npt.NDArray[np.bool_], ready: npt.NDArray[np.bool_], *, running: bool
     ) -> None:
-        """Record the present errors, and predict if it is time.
+        """Record the present errors; make a prediction if one is due.
 
         Parameters
         ----------
         able, ready
-            Heliostats that may be measured on this day, and those ready now, (N,).
+            Heliostats that may be measured on this day, and heliostats that are ready now, (N,).
         running
             Whether calibration is running; otherwise no prediction is made.
         """

@@ -1,8 +1,8 @@
 """Safety-table readings supplied by programs, for sensors that the plant does not read itself.
 
-A reading counts from the time of its measurement and becomes stale from then on, like a reading
-from a file. Only readings that the links file declares as supplied by programs are accepted, so
-that an account alone cannot replace a sensor that the plant reads.
+A reading ages from the time of its measurement, like a reading from a file. Only readings that the
+links file declares as supplied by programs are accepted, so that an account alone cannot replace a
+sensor that the plant reads.
 """
 
 import math
@@ -49,9 +49,9 @@ class GivenReadings:
         name
             Reading of the safety table.
         value
-            Value in the unit of its row.
+            Value, in the unit of the table row.
         at
-            Time of the measurement, Unix s.
+            Time of the measurement, POSIX s.
 
         Raises
         ------

@@ -69,7 +69,7 @@ def figures(
 
 
 class History:
-    """Records figures of a plant every minute.
+    """Records the figures of a plant every minute.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class History:
         self._plant, self._records, self._now = plant, records, now
 
     async def run(self) -> None:
-        """Work until cancelled."""
+        """Record figures until cancelled."""
         while self._records is not None:
             await self.take(self._records)
             await sleep_until(self._plant.clock, self._plant.now() + EVERY)

@@ -36,14 +36,14 @@ class Forgetting(Protocol):
     """Records whose old events can be removed."""
 
     def forget_events(self, before: float) -> None:
-        """Remove events before a time, and alarms that were cleared and acknowledged by then."""
+        """Remove events before a time, and alarms cleared and acknowledged by that time."""
         ...
 
 
 class Keeping:
     """The plant's memory of its calibrations, in a store; without a store it does nothing.
 
-    It keeps and numbers sightings, and each new calibration, for the plant's beliefs.
+    For the plant's beliefs, it stores each new calibration, and stores and numbers sightings.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Keeping:
     Attributes
     ----------
     lost
-        The last failure to keep a record, empty if the last attempt succeeded.
+        The last failure to keep a record; "" if the last attempt succeeded.
     """
 
     def __init__(self, names: Sequence[str], beliefs: Beliefs, records: Records | None) -> None:
@@ -67,11 +67,11 @@ class Keeping:
 
     @property
     def problem(self) -> str:
-        """Why nothing can be kept now, empty if it can."""
+        """Why records cannot be kept now; "" if they can."""
         return self.lost or (self._records.problem if self._records is not None else "")
 
     def recall(self) -> None:
-        """Load the stored calibrations into the plant's beliefs, and keep new ones from now on."""
+        """Load the stored calibrations into the plant's beliefs, and from now on keep new ones."""
         records = self._records
         if records is None:
             return
@@ -105,12 +105,12 @@ class Keeping:
             self._beliefs.flights = self._beliefs.flights.adding(taken)
 
     def keep_flight(self, flight: Flight, entry: FlightEntry) -> Identities:
-        """Keep a flight; return the numbers of its sightings, 0 without a store.
+        """Keep a flight; return the numbers of its sightings (0 if there is no store).
 
         Raises
         ------
         StoreError
-            If it cannot be kept.
+            If the flight cannot be kept.
         """
         if self._records is None:
             return np.zeros(len(flight.sightings), np.int64)
@@ -120,7 +120,7 @@ class Keeping:
         )
 
     def record(self, fact: Fact) -> None:
-        """Keep a fact; `lost` says why one could not be kept."""
+        """Keep a record; if this fails, `lost` says why."""
         if self._records is None:
             return
         try:
@@ -133,7 +133,7 @@ class Keeping:
         return [] if self._records is None else self._records.learnings()
 
     def timetable(self) -> TimetableRecord | None:
-        """Return the timetable that an operator last put in force; None: no operator has."""
+        """Return the timetable that an operator last activated; None if no operator has."""
         kept = [] if self._records is None else self._records.timetables()
         return kept[0] if kept else None
 
@@ -142,7 +142,7 @@ class Keeping:
         return [] if self._records is None else self._records.outlooks(since)
 
     def _number(self, name: str, target: str, new: Sightings) -> Identities:
-        """Keep sightings; return their numbers, 0 where they could not be kept."""
+        """Keep sightings; return their numbers (0 where they could not be kept)."""
         assert self._records is not None
         try:
             return self._records.record_sightings((name,), new, target=target)
@@ -152,7 +152,7 @@ class Keeping:
 
     def _keep(self, records: Records, record: HeliostatCalibration) -> None:
         if (record.sightings == 0).any():
-            return  # its sightings could not be kept; `lost` says why
+            return  # the sightings could not be kept; `lost` says why
         try:
             records.record_calibration(record)
         except StoreError as error:
@@ -161,7 +161,7 @@ class Keeping:
     def results(self, limit: int) -> tuple[CalibrationEntry, ...]:
         """Return the results of the last visits before the program started, oldest first.
 
-        Errors that were not stored are NaN.
+        An error that was not stored is NaN.
         """
         visits = [] if self._records is None else self._records.visits(limit)
         nan, known, found = float("nan"), dict[str, int](), list[CalibrationEntry]()
@@ -230,7 +230,7 @@ class Keeping:
     # -- heliostats out of service, and events ---------------------------------------------
 
     def lockouts(self) -> tuple[Lockout, ...]:
-        """Return the personal locks in force, including those past their expected end."""
+        """Return the personal locks in force, including locks past their expected end."""
         if self._records is None:
             return ()
         return tuple(

@@ -2,8 +2,8 @@
 
 Hyperparameters describe how far the heliostats of a group differ from the plant file, how their
 drives drift, and how noisy their photographs are. Visits use them to follow the drift, and they
-determine how predicted errors, the schedule and the ellipses grow. An operator may start it at any
-time; no heliostat moves.
+determine the growth of predicted errors, in the schedule and in the displayed ellipses. An operator
+may start learning at any time; no heliostat moves.
 """
 
 import json
@@ -50,7 +50,10 @@ class Learner(Protocol):
 
 @dataclass
 class _Group:
-    """What is in force for one group (version 0: the defaults), and how the last attempt ended."""
+    """The hyperparameters in force for one group, and how the last attempt ended.
+
+    Version 0 stands for the defaults.
+    """
 
     entry: LearningEntry
     said: str = "the default values are in force because nothing has been learnt yet"
@@ -64,7 +67,7 @@ class Learning:
     Parameters
     ----------
     plant, log, keeping
-        The controller, the logbook for events, and the memory.
+        The controller, the logbook for events, and the store of results.
     model
         The parameters fitted for a heliostat with few sightings: a name of the table, or names.
     learner
@@ -142,7 +145,7 @@ class Learning:
     # -- learning --------------------------------------------------------------------------
 
     async def step(self, *, night: bool) -> None:
-        """Learn one group that is due: one that operators requested, or at night any group."""
+        """Learn one group that is due: a group that operators requested or, at night, any group."""
         if self._learner is None:
             return
         now = self._utc()
@@ -183,7 +186,7 @@ class Learning:
             self._log.event("calibration", person.name, f"group {name}: {group.said}")
 
     def _judged(self, name: str, group: _Group, person: Person, found: LearntGroup) -> str:
-        """Put the result in force if it predicts photographs better; return the message."""
+        """Activate the result if it predicts photographs better; return a message about it."""
         origin = f"{found.sightings:,} photographs of {found.heliostats} heliostats"
         if not found.gain > 0.0:
             return f"{origin}: new values would not predict them better, so nothing changed"

@@ -82,7 +82,7 @@ class Logbook:
     # -- taking ----------------------------------------------------------------------------
 
     def tapped(self, links: Mapping[str, Link]) -> dict[str, Link]:
-        """Return the links for the plant, wrapped so that every message is noted in this book."""
+        """Return the plant's links, wrapped so that every message is noted in this logbook."""
         self._links.update(links)
         return {
             name: TappedLink(link, self._clock, _Listener(name, self))
@@ -127,7 +127,10 @@ class Logbook:
         severity: Severity = Severity.INFO,
         heliostats: Sequence[str] = (),
     ) -> None:
-        """Record an event; see `EventRow`. ``heliostats``: all heliostats that it concerns."""
+        """Record an event; see `EventRow`.
+
+        ``heliostats`` are all heliostats that the event concerns.
+        """
         number, names = next(self._numbers), tuple(heliostats)
         if len(names) > MOST_NAMED or not all(name in text for name in names):
             self._named[number] = names
@@ -154,7 +157,10 @@ class Logbook:
         self.take_alarm(alarms.RECORD_REFUSED.raised(problem=problem))
 
     def check_records(self, lost: str) -> None:
-        """Raise and clear the alarms about the store; ``lost``: why another record was not kept."""
+        """Raise and clear the alarms about the store.
+
+        ``lost`` is the reason why a record of another kind was not kept.
+        """
         if self._records is None:
             return
         problem, kind = lost or self._records.problem, alarms.RECORDS
@@ -205,12 +211,12 @@ class Logbook:
         return tuple(list(self._events)[: -limit - 1 : -1])
 
     def named(self, number: int) -> tuple[str, ...]:
-        """Return the heliostats of an event whose text does not name them all.
+        """Return the heliostats of an event whose text does not name all of them.
 
         Raises
         ------
         UnknownNameError
-            If there is no such event, or its text names all.
+            If there is no such event, or its text names all its heliostats.
         """
         if number not in self._named:
             raise UnknownNameError("event of many heliostats", str(number), ())

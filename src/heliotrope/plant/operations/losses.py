@@ -30,7 +30,7 @@ _NONE: Mask = np.zeros(1, dtype=np.bool_)
 
 
 class Losses:
-    """Losses of wanted heliostats, and the wait for an operator after a large number.
+    """Losses of wanted heliostats, and the wait for an operator after a large loss.
 
     Parameters
     ----------
@@ -39,15 +39,15 @@ class Losses:
     most
         Number of heliostats that may be lost within `SPAN` without waiting for an operator.
     records
-        Store of alarms: a wait survives a restart, and an emergency active when the last program
-        ended starts a wait; None: neither.
+        Store of alarms. With a store, a wait survives a restart, and an emergency that was active
+        when the last program ended starts a wait; None: no store.
     stop
         Called when a wait begins.
 
     Attributes
     ----------
     reason
-        Why automatic control waits for an operator, empty if it does not.
+        Why automatic control waits for an operator; "" if it does not wait.
     """
 
     def __init__(
@@ -71,10 +71,11 @@ class Losses:
             self._wait(alarm)
 
     def look(self, wanted: Mask, at_stow: Mask = _NONE) -> Mask:
-        """Return a mask of the wanted heliostats (N,) lost since the last check, (N,).
+        """Return a mask of the wanted heliostats that were lost since the last check, (N,).
 
-        A heliostat IDLE at its stow position does not count as lost when it is stowed. Nor do the
-        heliostats diagnosed ``at_stow`` (N,), which move about that position.
+        A heliostat that is IDLE at its stow position does not count as lost when it is stowed.
+        Heliostats under diagnosis ``at_stow``, (N,), which move about that position, do not count
+        either.
         """
         field, now = self._plant.field, self._plant.now()
         there = field.among((states.IDLE,), now) & (field.rows["flags"] & meanings.AT_STOW != 0)
@@ -103,7 +104,7 @@ class Losses:
         return lost
 
     def settling(self) -> Mask:
-        """Return a mask of the heliostats lost recently and not to be raised yet, (N,)."""
+        """Return a mask of the heliostats lost recently that must not be raised yet, (N,)."""
         return np.asarray(self._plant.now() - self._lost_at < SPAN)
 
     def resume(self) -> None:

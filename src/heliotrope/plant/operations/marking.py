@@ -1,10 +1,10 @@
-"""Corner markers that a user clicks in a camera picture, for the perspective of its target.
+"""Target corners that a user clicks in a camera picture, which define the camera's view.
 
 `heliotrope camera teach` does the same without a running plant (`imaging.targets.teaching`). Here
 the running camera uses the new view for its next photograph, and a plant file in the data folder
 stores it in the form that teaching writes, with dated copies of older versions. The plant's own
-file is not changed: the program must not be able to change it, and in a simulation its cameras are
-the true ones.
+file is not changed, because the program must not be able to change it, and because in a simulation
+that file describes the true cameras.
 """
 
 import asyncio
@@ -54,18 +54,18 @@ Pixel = tuple[float, float]
 
 
 class MarkedCameras(Protocol):
-    """Cameras whose view of a target can be replaced while they work."""
+    """Cameras whose view of a target can be replaced while they are in use."""
 
     def eye(self, target: str) -> Camera:
-        """Return the camera of a target, as it is known."""
+        """Return the camera of a target, as now known."""
         ...
 
     def frame(self, target: str) -> Frame:
-        """Return its newest frame."""
+        """Return the newest frame of a target's camera."""
         ...
 
     def take_view(self, camera: Camera, target: Target, pictures: Mapping[str, FloatArray]) -> None:
-        """Evaluate later photographs with a camera, a target's marks, and taught pictures."""
+        """Set the camera, target marks and reference pictures for evaluating later photographs."""
         ...
 
 
@@ -87,7 +87,7 @@ class PictureToMark:
     target, camera
         Names.
     number
-        Of the picture, for `Marking.picture` and `Marking.mark`.
+        Number of the picture, for `Marking.picture` and `Marking.mark`.
     size
         Width and height, px.
     aspect
@@ -109,7 +109,7 @@ class PictureToMark:
 
 @dataclass(frozen=True)
 class MarkedPoint:
-    """A point as marked: pixel, standard deviation and residual, px; kind of its mark; a note."""
+    """A marked point: pixel; standard deviation and residual, px; kind of mark; note."""
 
     name: str
     at: Pixel
@@ -130,7 +130,7 @@ class MarksView:
     saved
         Whether the view is in use; otherwise it was only tried.
     points
-        Points in the order given.
+        Points, in the order in which they were passed.
     residual
         RMS residual of the points, px.
     sigma
@@ -161,9 +161,9 @@ class Marking:
     plant, log
         The controller, and the logbook for events.
     file
-        Plant file that stores the views, next to ``before.toml``, a copy of the plant's own file at
-        that time. A view is valid until the plant's own file has a different view. None: views are
-        lost when the program ends.
+        Plant file that stores the views. Beside it, ``before.toml`` is a copy of the plant's own
+        file at that time. A view is valid until the plant's own file contains a different view.
+        None: views are lost when the program ends.
     """
 
     def __init__(
@@ -179,7 +179,7 @@ class Marking:
         self._number = 0
 
     def resume(self) -> None:
-        """Load the stored views, except those that no longer match the plant's own file.
+        """Load the stored views, except views that no longer match the plant's own file.
 
         Raises
         ------
@@ -213,7 +213,7 @@ class Marking:
         return next((c for c in self._plant.design.cameras if c.name == name), None)
 
     def _fits(self, before: Plant, camera: Camera, target: str) -> bool:
-        """Return whether the plant's own file still has the view from before the marking."""
+        """Return whether the plant's own file still contains the view from before the marking."""
         old = next((c for c in before.cameras if c.name == camera.name), None)
         then = next((t for t in before.targets if t.name == target), None)
         now = self._plant.design.target(target)
@@ -275,7 +275,7 @@ class Marking:
         Raises
         ------
         UnknownNameError
-            If it is no longer held.
+            If the picture is no longer held.
         """
         frame = self._of(number)[1]
         return await asyncio.to_thread(lambda: _jpeg(shown_pixels(frame)))
@@ -314,7 +314,7 @@ class Marking:
             If the points are too few, outside the picture, or not arranged like the target, or if
             the plant file cannot be written.
         RefusedError
-            If it is not accepted.
+            If the request is not accepted.
         UnknownNameError
             If there is no such target, point or picture.
         """
@@ -405,14 +405,17 @@ def _near(a: FloatArray | None, b: FloatArray | None) -> bool:
 
 
 def _with(plant: Plant, camera: Camera, target: Target) -> Plant:
-    """Return a plant with another camera, and with the marks of a target."""
+    """Return a plant with one camera replaced, and with new marks on a target."""
     here = replace(plant.target(target.name), marks=target.marks)
     targets = tuple(here if t.name == target.name else t for t in plant.targets)
     return with_camera(replace(plant, targets=targets), camera)
 
 
 def _expected(camera: Camera, point: FloatArray, size: tuple[int, int]) -> Pixel | None:
-    """Return the expected pixel of a point; None if out of view or if the camera is not located."""
+    """Return the expected pixel of a point.
+
+    Returns None if the point is out of view or the camera is not located.
+    """
     if camera.position is None:
         return None
     x, y = (float(v) for v in project(camera, point))
@@ -462,7 +465,7 @@ def _view_of(taught: Taught, frame: Frame, kept: str) -> MarksView:
 
 
 def _rectified(taught: Taught, frame: Frame, target: Target) -> Image:
-    """Return the target from the front, uint8 (H, W), as the new view shows it."""
+    """Return the target as seen from the front, rectified with the new view, uint8 (H, W)."""
     face, known = faces((target,))[0], known_points(target)
     plane = face.plane(np.array([known[p.name] for p in taught.points]))
     pixels = np.array([p.pixel for p in taught.points])

@@ -67,7 +67,7 @@ class MovementChecks:
 
     @property
     def resting(self) -> Mask:
-        """Mask of the heliostats not to be raised: not yet diagnosed today, or stalled, (N,)."""
+        """Mask of the heliostats that must not be raised: not diagnosed today, or stalled, (N,)."""
         plant = self._plant
         resting = np.zeros(len(plant.field), dtype=np.bool_)
         waiting = plant.drive_checks.due | plant.drive_checks.stalled.keys()
@@ -76,13 +76,13 @@ class MovementChecks:
 
     @property
     def moved(self) -> Mask:
-        """A mask of the heliostats under diagnosis, (N,)."""
+        """Mask of the heliostats under diagnosis, (N,)."""
         moved = np.zeros(len(self._plant.field), dtype=np.bool_)
         moved[[self._plant.field.place(name) for name in self._running]] = True
         return moved
 
     async def step(self, token: int, free: Mask) -> None:
-        """Diagnose the free heliostats (N,) at stow that are due, at most `MOST` at once.
+        """Diagnose the free heliostats at stow that are due, at most `MOST` at once.
 
         Parameters
         ----------

@@ -7,8 +7,8 @@ heliostat as plain values, `logbook` for alarms, events and packets, `automatic`
 plan and timetable.
 
 Operator commands pass through here so that automatic control knows what operators want: a heliostat
-that an operator has stowed, defocused or locked stays so until an operator gives it back, and a
-heliostat that is lost after an operator has raised it is left to the operators.
+that an operator has stowed, defocused or locked stays so until an operator gives it back. If a
+heliostat is lost after an operator has raised it, automatic control does not raise it again.
 """
 
 import asyncio
@@ -93,7 +93,7 @@ class Photographer(Protocol):
 
 @dataclass(frozen=True)
 class Photography:
-    """What a plant does with photographs.
+    """How a plant takes, stores and displays photographs.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class Operations:
     ----------
     plant, logbook, automatic, viewer, security, pictures, parameters, approvals, marking,
     flux_check
-        See their classes; readers access them directly.
+        The parts of the plant; see their classes. Callers access them directly.
     telemetry
         Folder of the telemetry; None: no telemetry is archived.
     begun
@@ -198,7 +198,7 @@ class Operations:
             await asyncio.sleep(_LOOKED)
 
     async def _compare(self) -> None:
-        """Compare the flux on the receiver with the predicted one."""
+        """Compare the flux on the receiver with the predicted flux."""
         while True:
             # The worker process may have ended, in which case another one is started.
             with contextlib.suppress(HeliotropeError):
@@ -274,7 +274,7 @@ class Operations:
         return explain(self.plant, self.automatic, self.logbook, heliostat, on)
 
     async def journal(self, query: JournalQuery) -> list[JournalEntry]:
-        """Return events, alarms and commands of all days, the latest first.
+        """Return the events, alarms and commands of all days, the latest first.
 
         Raises
         ------
@@ -314,7 +314,8 @@ class Operations:
     ) -> Trend:
         """Return a quantity of the plant or of a heliostat over time; see `trends.trend`.
 
-        Without an end: until now; without a start: one day before the end.
+        The time span ends now if no end is specified, and begins one day before its end if no start
+        is specified.
         """
         if heliostat:
             self.plant.field.place(heliostat)
@@ -343,7 +344,7 @@ class Operations:
         self._tell(person, text.strip(), NOTE)
 
     async def _read(self, what: str, read: Callable[[Records], T]) -> T:
-        """Return data that a thread reads from the store, including the latest records."""
+        """Return data read from the store in a thread, including the latest records."""
         if self._records is None:
             raise InputError(f"{what}: this plant keeps no records; run it with a data folder")
         await self._records.confirm()
@@ -365,7 +366,7 @@ class Operations:
         return SunView(at, self.plant.sun_vector(), float(found.azimuth), float(found.elevation))
 
     async def receiver_flux(self, name: str = "") -> PredictedView:
-        """Return the predicted flux on a receiver ("": the first); see `PredictedFlux`.
+        """Return the predicted flux on a receiver ("": the first receiver); see `PredictedFlux`.
 
         Raises
         ------
@@ -408,14 +409,14 @@ class Operations:
     ) -> Ticket:
         """Calibrate a heliostat, or only search for its beam, before all others.
 
-        With other heliostats (``together``) it is calibrated in one joint visit, as soon as all are
-        ready. With ``receiver`` it is measured while it tracks the receiver, as soon as all of them
-        do. The ticket ends with the result of the visit.
+        With other heliostats (``together``), the heliostat is calibrated in one joint visit, as
+        soon as all are ready. With ``receiver``, the heliostats are measured while they track the
+        receiver, as soon as all do. The ticket ends with the result of the visit.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer, or automatic control cannot do it now.
+            If the person is a viewer, or automatic control cannot calibrate the heliostat now.
         UnknownNameError
             If there is no such heliostat or target.
         """
@@ -438,7 +439,7 @@ class Operations:
         )
 
     async def photograph(self, person: Person, target: str) -> CameraView:
-        """Photograph a target now, with whatever beam is on it; return what is seen.
+        """Photograph a target now, with whatever beam is on it; return the findings.
 
         Raises
         ------
@@ -459,7 +460,7 @@ class Operations:
         return view
 
     def learn(self, person: Person, group: str = "") -> None:
-        """Learn a heliostat group ("": all) now; see `Learning.order`."""
+        """Learn a heliostat group ("": all groups) now; see `Learning.order`."""
         self.automatic.learning.order(person, group)
         self._tell(person, f"requested learning for {group or 'all groups'}")
 
@@ -488,10 +489,10 @@ class Operations:
     ) -> Ticket:
         """Lock heliostats, targets, receivers or the tower with a person's own lock.
 
-        Locked heliostats go to stow, and nobody moves them; so do heliostats whose beams are aimed
-        at a locked target or receiver, and all heliostats under a locked tower. A locked object
-        returns to service when everyone has removed their lock. The ticket is done for a heliostat
-        once it is parked.
+        Locked heliostats go to stow, and nobody can move them. The same applies to heliostats whose
+        beams are aimed at a locked target or receiver, and to all heliostats if the tower is
+        locked. A locked object returns to service when everyone has removed their lock. The ticket
+        is done for a heliostat once it is parked.
 
         Parameters
         ----------
@@ -500,7 +501,7 @@ class Operations:
         heliostats, targets, receivers, tower
             What to lock.
         reason
-            Why.
+            Reason for the lock.
         hours
             Expected time until return to service, h; NaN if unknown. The lock remains beyond that
             time.
@@ -534,13 +535,13 @@ class Operations:
     ) -> None:
         """Remove a person's own locks; no heliostat moves.
 
-        An engineer may remove the locks of an ``owner`` who cannot, naming the owner and a reason.
+        An engineer may remove the locks of an ``owner`` who cannot remove them, stating a reason.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer, has no lock where others have one, or removes another
-            person's lock without being an engineer or without a reason.
+            If the person is a viewer, has no lock on an object that other persons have locked, or
+            removes another person's lock without being an engineer or without a reason.
         UnknownNameError
             If there is no such heliostat, target or receiver.
         """
@@ -576,7 +577,7 @@ class Operations:
         *,
         tower: bool,
     ) -> list[tuple[Kind, str]]:
-        """Return the places to lock or give back, by kind and name."""
+        """Return the places to lock or unlock, by kind and name."""
         for name in heliostats:
             self.plant.field.place(name)
         for name in targets:
@@ -651,7 +652,7 @@ class Operations:
         return ticket
 
     def aim(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
-        """Aim heliostats at points, at which they remain aimed; see `PlantController.aim`."""
+        """Aim heliostats at points; they keep these aims. See `PlantController.aim`."""
         ticket = self.plant.aim(person, token, points)
         self._aiming.by_person(ticket.heliostats, aimed=True)
         self._told(person, ticket)
@@ -674,15 +675,15 @@ class Operations:
         heliostats
             Names; () for all.
         where
-            Receiver or target: for the first receiver the aims of the design, or those under the
-            flux limit; for others the centre.
+            Receiver or target. For the first receiver, the aims are the aims of the design, or the
+            aims under the flux limit; for any other surface, the centre.
         place
             Point on the unrolled receiver, right of and above its middle, m; see `Receiver.point`.
 
         Raises
         ------
         InputError
-            If the point is not on the receiver, or ``where`` is a target.
+            If the point is not on the receiver, or a point is specified and ``where`` is a target.
         UnknownNameError
             If there is no receiver or target of that name.
         """
@@ -746,7 +747,7 @@ class Operations:
         return order
 
     def withdraw(self, person: Person, owner: str = "") -> None:
-        """Withdraw the person's own emergency order, or an ``owner``'s as an engineer.
+        """Withdraw the person's own emergency order; an engineer may withdraw an ``owner``'s order.
 
         Raises
         ------
@@ -774,9 +775,10 @@ class Operations:
         self._tell(person, f"acknowledged {condition} {subject}".strip(), "command")
 
     def give_back(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
-        """Give heliostats (() for all) to automatic control, which raises and calibrates them.
+        """Return heliostats (() for all) to automatic control, which raises and calibrates them.
 
-        The ticket is done for a heliostat once it follows, and otherwise states why it does not.
+        The ticket is done for a heliostat once the heliostat follows automatic control; otherwise
+        it states why the heliostat does not.
 
         Raises
         ------
@@ -842,7 +844,7 @@ def _some(heliostats: Sequence[str]) -> str:
 
 
 def _named(places: Sequence[tuple[Kind, str]]) -> str:
-    """Return the locked places in words; heliostats by their bare names."""
+    """Return the locked places in words; heliostats appear as bare names."""
     bare = (Kind.HELIOSTAT, Kind.TOWER)
     return _some([name if kind in bare else f"{kind} {name}" for kind, name in places])
 

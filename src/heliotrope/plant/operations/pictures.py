@@ -1,9 +1,9 @@
 """Calibration photographs, stored with their results and found by heliostat and time.
 
-The pictures are JPEG files in a folder, with one record each in `pictures.sqlite` beside them. They
-are thinned out by age, and the folder never exceeds its limit by more than one visit; the oldest
-are removed first. A disk failure costs pictures, never a calibration. The photographs of a coded
-visit are stored once, and found under each of its heliostats.
+The pictures are JPEG files in a folder, with one record each in `pictures.sqlite` beside them. Old
+pictures are thinned out, and the folder never exceeds its limit by more than one visit; the oldest
+pictures are removed first. A disk failure costs pictures, never a calibration. The photographs of a
+coded visit are stored once, and found under each of its heliostats.
 """
 
 import asyncio
@@ -25,9 +25,10 @@ from heliotrope.plant.operations.views import CalibrationEntry, CameraView, Pict
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.visits.target_light import Exposed, LightCamera, TargetLight
 
-#: Maximum number of photographs kept of one visit; of a long search, the last ones.
+#: Maximum number of photographs kept of one visit; of a long search, the last photographs are kept.
 _MOST = 24
-#: The same for a coded visit; of a long series or of several, the last ones.
+#: The same for a coded visit; of a long series, or of several series, the last photographs are
+#: kept.
 _MOST_CODED = 32
 #: Interval between checks for pictures that are too old, s.
 _THIN_EVERY = 600.0
@@ -119,7 +120,7 @@ class Pictures:
     Attributes
     ----------
     problem
-        Why the last picture could not be stored, empty if it was stored.
+        Why the last picture could not be stored; "" if it was stored.
     """
 
     def __init__(
@@ -260,7 +261,7 @@ class Pictures:
     def find(
         self, heliostat: str, limit: int, then: Callable[[list[PictureRow] | Exception], None]
     ) -> None:
-        """Call ``then`` with the newest pictures of a heliostat ("": requested by users)."""
+        """Call ``then`` with the newest pictures of a heliostat ("": pictures users requested)."""
 
         def work() -> list[PictureRow]:
             with self._table() as table:

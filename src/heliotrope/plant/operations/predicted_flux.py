@@ -1,4 +1,4 @@
-"""The flux that the field is expected to bring to its receivers.
+"""Predicts the flux that the field brings to its receivers.
 
 Every mirror is in the pose that its reported step counts yield under its present calibration, so
 heliostats that are turned away or at stow shade and block in those poses.
@@ -76,7 +76,9 @@ class PredictedFlux:
         self._computing: asyncio.Task[None] | None = None
 
     async def everywhere(self) -> dict[str, PredictedView]:
-        """Return the flux on each receiver, by name; after `PATIENCE` the last known flux.
+        """Return the flux on each receiver, by name.
+
+        If the computation takes longer than `PATIENCE`, the last known flux is returned.
 
         Raises
         ------
@@ -117,9 +119,11 @@ class PredictedFlux:
         self._made_at = now
 
     def scene(self, now: float) -> Scene:
-        """Return the field as it stands: heliostats on a receiver bring light, others only shade.
+        """Return the field as it stands.
 
-        The irradiance is the measured one if there is a sensor.
+        Heliostats aimed at a receiver bring light; all other heliostats only shade and block.
+
+        The measured irradiance is used if there is a sensor.
         """
         plant, frame, beams = self._plant, self._viewer.frame(), self._plant.beams
         normal, center = beams.armature.pose(beams.drives.angles(plant.field.posed))
@@ -183,14 +187,14 @@ def _uncertain(view: FluxView, engine: FieldFlux) -> PredictedView:
 
 
 def _from_outside(view: PredictedView, receiver: Receiver) -> PredictedView:
-    """Return a map whose columns run to the right as seen from outside: `Receiver.point`."""
+    """Return a map whose columns run to the right as seen from outside; see `Receiver.point`."""
     right, order = columns_from_outside(receiver, view.right)
     shown = {name: getattr(view, name)[:, order] for name in ("flux", "sigma")}
     return replace(view, right=right, **shown)
 
 
 def columns_from_outside(receiver: Receiver, right: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return where a map's columns lie as seen from outside, m, and their order, (W,) each.
+    """Return the positions of a map's columns as seen from outside, m, and their order, each (W,).
 
     The engine's columns, ``right``, run clockwise; on a full cylinder they start in the north.
     """

@@ -74,8 +74,8 @@ class Raising:
     Attributes
     ----------
     aims
-        Aims on the receiver, ENU, m, (3,), by name: a heliostat without one stays at standby. Under
-        a flux limit they are `Aiming`'s.
+        Aims on the receiver, ENU, m, (3,), by name; a heliostat without an aim stays at standby.
+        Under a flux limit, `Aiming` chooses the aims.
     wanted
         Which heliostats automatic control may move, (N,).
     left
@@ -127,8 +127,8 @@ class Raising:
     def want(self, heliostats: Sequence[str], *, wanted: bool, by_person: bool = False) -> None:
         """Put heliostats under automatic control, or remove them.
 
-        With ``by_person`` an operator raises them; if lost afterwards, they are left to the
-        operators.
+        With ``by_person``, an operator raises them; if they are lost afterwards, automatic control
+        does not raise them again.
         """
         rows = [self._plant.field.place(name) for name in heliostats]
         self._by_people[rows] = by_person & (self._by_people[rows] | ~self.wanted[rows])
@@ -138,7 +138,7 @@ class Raising:
             self.attempts.done(name)
 
     def lose(self, lost: Mask) -> None:
-        """Leave lost heliostats (N,) that operators had raised to the operators."""
+        """Stop controlling those of the lost heliostats (N,) that operators had raised."""
         self.wanted &= ~(lost & self._by_people)
         self._failed(np.flatnonzero(lost & self.wanted), "left the receiver without an order")
 
@@ -147,14 +147,14 @@ class Raising:
             self.attempts.failed(self._plant.field.names[row], reason, self._plant.now())
 
     def given_up(self) -> Mask:
-        """Return a mask of the heliostats not raised for now, after too many failures, (N,)."""
+        """Return a mask of the heliostats not raised for now after too many failures, (N,)."""
         resting = np.zeros(len(self._plant.field), dtype=np.bool_)
         waiting = self.attempts.waiting(self._plant.now())
         resting[[self._plant.field.place(name) for name in waiting]] = True
         return resting
 
     def why_not(self, heliostat: str) -> str | None:
-        """Return the reason why a heliostat is not raised, None if it is or waits for its turn."""
+        """Return why a heliostat is not raised; None if it is raised or waits for its turn."""
         if why := self._plant.drive_checks.stalled.get(heliostat):
             return f"{why}: see the alarm {alarms.DRIVE_STALLED.name}"
         if heliostat in self._blocked:
@@ -164,7 +164,7 @@ class Raising:
         return None
 
     def waits(self, heliostats: Sequence[str]) -> dict[str, str]:
-        """Return what wanted heliostats wait for, if it is not only their turn."""
+        """Return what wanted heliostats wait for, apart from their turn."""
         plant = self._plant
         found = plant.guards.reasons(Asked("APPROACH", tuple(heliostats)), refusals.NOT_NOW)
         asked = np.zeros(len(plant.field), dtype=np.bool_)
@@ -198,19 +198,19 @@ class Raising:
         return known
 
     def _asked(self, command: str, rows: Rows) -> Asked:
-        """Return a command to the heliostats of some rows (K,), in the form that guards check.
+        """Return a command to heliostats (K,) in the form that guards check.
 
-        Only the command itself shows whether their paths are free.
+        Whether the paths are free is checked only when the command is issued.
         """
         names = tuple(self._names[row] for row in rows)
         aims = [self.aims[name] for name in names] if command == "TRACK" else []
         return Asked(command, names, np.stack(aims) if aims else None)
 
     def _first(self, command: str, rows: Rows) -> Rows:
-        """Return the first rows (K,) of heliostats that may be given a command.
+        """Return the first heliostats, as indices (K,), that may be sent a command.
 
-        At most `ASKED` are checked; if all of them are blocked, the next step checks the heliostats
-        after them.
+        At most `ASKED` heliostats are checked; if all of them are blocked, the next step continues
+        with the heliostats after them.
         """
         asked = np.roll(rows, -int(np.searchsorted(rows, self._next.get(command, 0))))[:ASKED]
         blocked = self._plant.guards.reasons(self._asked(command, asked))
@@ -230,15 +230,15 @@ class Raising:
         return len(names)
 
     def release(self, heliostat: str) -> None:
-        """Allow a new command to a heliostat at once: its visit to a target has ended."""
+        """Allow a new command to a heliostat at once, because its visit to a target has ended."""
         self._busy_until[self._plant.field.place(heliostat)] = -math.inf
 
     def _clear_of_targets(
         self, clearance: float, aims: Mapping[str, FloatArray], about: float
     ) -> Mask:
-        """Return a mask of the uncalibrated beams that miss all targets on the path up, (N,).
+        """Return a mask of the uncalibrated beams that would miss all targets at the aims, (N,).
 
-        ``about``: how far from these aims they may be sent, m.
+        ``about`` is how far from these aims the beams may be sent, m.
         """
         plant = self._plant
         if not aims:
@@ -252,14 +252,14 @@ class Raising:
         return np.asarray(math.sqrt(2.0) * clearance * slant < room)
 
     def _on_targets(self, points: FloatArray) -> Mask:
-        """Return a mask of the points (N, 3) on a target, where an operator has ended the visit."""
+        """Return a mask of points (N, 3) on a target where an operator has ended the visit."""
         on_target = np.zeros(len(points), dtype=np.bool_)
         for middle, reach in self._targets:
             on_target |= np.linalg.norm(points - middle, axis=-1) <= reach
         return on_target
 
     def stuck(self, visiting: Collection[str], resting: Mask) -> Rows:
-        """Return the rows of wanted heliostats that can proceed only by way of stow.
+        """Return the indices of wanted heliostats that can proceed only by way of stow.
 
         A heliostat refuses to track unless it has reached standby from stow since its last boot or
         stow. A heliostat that stores parameters other than the desired ones may not move, and
@@ -324,7 +324,7 @@ class Raising:
             await self._join(rows, token, visiting)
 
     async def _rest_again(self, rows: Rows, token: int) -> None:
-        """Send heliostats at stow their standby points, because those they store are unknown."""
+        """Send standby points to heliostats at stow whose stored standby points are unknown."""
         plant = self._plant
         points = {plant.field.names[row]: plant.standbys[row].copy() for row in rows}
         given = self._give(
@@ -364,7 +364,7 @@ class Raising:
     def _give(
         self, rows: Rows, state: int, give: Callable[[tuple[str, ...]], Ticket]
     ) -> tuple[tuple[str, ...], Ticket] | None:
-        """Issue a command to the heliostats whose beams have a clear path; the others wait."""
+        """Issue a command to the heliostats whose beams have a clear path; the rest wait."""
         names = tuple(self._plant.field.names[row] for row in rows)
         while names:
             try:
@@ -394,7 +394,7 @@ class Raising:
                 self._log.take_alarm(alarms.BEAM_BLOCKED.raised(name, reason=text))
 
     def _look_at_blocked(self) -> None:
-        """Raise alarms about beams blocked when their turn came; clear obsolete alarms."""
+        """Raise alarms about beams that were blocked in their turn; clear obsolete alarms."""
         for ticket in [ticket for ticket in self._joins if ticket.finished]:
             self._joins.remove(ticket)
             self._block(ticket.blocked, states.IDLE)

@@ -1,4 +1,4 @@
-"""The shift report: production, unavailable heliostats and operators' work in a time span."""
+"""The shift report: production, unavailable heliostats and operators' work in a period."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ class Production:
 
 @dataclass(frozen=True)
 class FieldErrors:
-    """Calibrated heliostats, and median and 90th percentile of their predicted errors, rad."""
+    """Number of calibrated heliostats; median and 90th percentile of predicted errors, rad."""
 
     at: float
     calibrated: int
@@ -112,7 +112,9 @@ class ShiftReport:
 
 
 def period(since: float, until: float, now: float) -> tuple[float, float]:
-    """Return the time span of a report, POSIX s; 0 means now, or one shift before the end.
+    """Return the time span of a report, POSIX s.
+
+    An end of 0 means now, and a start of 0 means one shift before the end.
 
     Raises
     ------
@@ -175,18 +177,18 @@ def report(
 
 
 def _lasted(rows: Sequence[PlantFigures], until: float) -> FloatArray:
-    """Return for how long each record of figures is valid, s, (R,)."""
+    """Return how long each record of figures is valid, s, (R,)."""
     times = [*(row.at for row in rows), until]
     return np.array([min(b - a, _STANDS) for a, b in pairwise(times)])
 
 
 def _of(rows: Sequence[PlantFigures], name: str) -> FloatArray:
-    """Return a figure from each record, (R,); NaN where it is unknown."""
+    """Return one figure from each record, (R,); NaN where the figure is unknown."""
     return np.array([row.values.get(name, np.nan) for row in rows])
 
 
 def _integral(values: FloatArray, lasted: FloatArray) -> float:
-    """Return the integral of a figure over the time in which it is known; NaN if it never is."""
+    """Return the integral of a figure over the time in which it is known; NaN if it is unknown."""
     known = np.isfinite(values)
     return float((values[known] * lasted[known]).sum()) if known.any() else float("nan")
 

@@ -80,14 +80,14 @@ class SecurityNote:
 
     @property
     def text(self) -> str:
-        """One line: what happened, to what, and from where."""
+        """The event in one line: what happened, to what, and from where."""
         about = f": {self.detail}" if self.detail else ""
         return f"{self.kind.words}{about}" + (f" (from {self.address})" if self.address else "")
 
 
 @dataclass
 class _Span:
-    """A span: when it began, s, the events that were recorded in it, and the others."""
+    """A time span: its start, s, and its numbers of recorded and unrecorded events."""
 
     begun: float
     recorded: int = 0
@@ -101,7 +101,7 @@ class EventCounter:
         self._spans: dict[tuple[SecurityEvent, str | None], _Span] = {}
 
     def admits(self, kind: SecurityEvent, who: str, now: float, count: int = 1) -> bool:
-        """Whether an event, or a total of ``count``, is recorded individually and not counted."""
+        """Whether an event, or a total of ``count`` events, is recorded rather than counted."""
         person, everybody = self._span((kind, who), now), self._span((kind, None), now)
         if person.recorded < MOST and everybody.recorded < MOST_OF_ALL:
             person.recorded += 1
@@ -115,7 +115,7 @@ class EventCounter:
         self._span((kind, who), now).more += count
 
     def sums(self, now: float, *, all_: bool = False) -> list[tuple[SecurityEvent, str, int]]:
-        """Return kind, user and number of the events counted in expired spans, or in all spans."""
+        """Return the kind, the user and the number of events counted in expired (or all) spans."""
         over = [key for key, span in self._spans.items() if all_ or now - span.begun >= SPAN]
         spans = [(*key, self._spans.pop(key).more) for key in over]
         return [(kind, who, more) for kind, who, more in spans if who is not None and more]
@@ -157,7 +157,7 @@ class SecurityLog:
     def note(
         self, kind: SecurityEvent, who: str = "", address: str = "", detail: str = "", more: int = 0
     ) -> None:
-        """Record an event of a kind, unless there were too many recently.
+        """Record an event, unless there were too many of its kind recently.
 
         A console passes the number of further events that it has counted as ``more``.
         """
@@ -182,7 +182,7 @@ class SecurityLog:
             self.forward(made)
 
     def look(self, refused_link: str = "") -> None:
-        """Clear alarms whose causes have gone; note links refused since the last call.
+        """Clear alarms whose causes have gone; record links refused since the last call.
 
         Totals of events that were not recorded individually are recorded once their minute is over.
         """

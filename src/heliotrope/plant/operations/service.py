@@ -47,7 +47,7 @@ class Service:
     Attributes
     ----------
     attempts
-        Orders to stow, by heliostat.
+        Attempts to stow heliostats, by heliostat.
     """
 
     def __init__(
@@ -62,11 +62,13 @@ class Service:
 
     @property
     def out(self) -> tuple[Lockout, ...]:
-        """The locks of persons."""
+        """The personal locks."""
         return tuple(self._plant.lockouts)
 
     def rows(self) -> npt.NDArray[np.bool_]:
-        """Return a mask of the heliostats that personal locks keep at stow or sent to stow, (N,).
+        """Return a mask of the heliostats that are out of service, (N,).
+
+        Personal locks keep them at stow, or have sent them to stow.
 
         The heliostats are locked themselves, their beams are aimed at a locked object, or the tower
         is locked.
@@ -79,7 +81,7 @@ class Service:
         return found
 
     def closed(self, target: str) -> str | None:
-        """Return the reason why no beam may be sent to a target, None if beams may."""
+        """Return why no beam may be sent to a target; None if beams may be sent."""
         locks = self._plant.lockouts
         return locks.text(Kind.TARGET, target) or locks.text(Kind.TOWER, TOWER) or None
 
@@ -130,9 +132,9 @@ class Service:
     def give_back(
         self, person: Person, places: Sequence[Place], owner: str = ""
     ) -> tuple[Lockout, ...]:
-        """Remove the locks of a person, or of another ``owner``; nothing moves.
+        """Remove a person's own locks, or the locks of another ``owner``; nothing moves.
 
-        Returns those removed; see `Operations.unhold`.
+        Returns the removed locks; see `Operations.unhold`.
         """
         locks, who = self._plant.lockouts, owner or person.name
         removed = []
@@ -151,7 +153,7 @@ class Service:
         return tuple(removed)
 
     def park(self) -> None:
-        """Stow heliostats that were taken out of service and have not reported stow yet.
+        """Stow heliostats that were taken out of service and have not yet reported stow.
 
         Once a heliostat has reported stow, no order is sent to it again, because someone may be
         working on it.

@@ -6,7 +6,7 @@ _DAY = 86_400.0
 
 
 def day_of(at: float, site: Site) -> int:
-    """Return the number of the day of local mean solar time, from 1970."""
+    """Return the day number, in local mean solar time, counted from 1970."""
     return int((at + _ahead(site)) // _DAY)
 
 
@@ -16,5 +16,5 @@ def end_of_day(at: float, site: Site) -> float:
 
 
 def _ahead(site: Site) -> float:
-    """Return local mean solar time less UTC, s."""
+    """Return local mean solar time minus UTC, s."""
     return site.longitude_deg / 360.0 * _DAY

@@ -1,8 +1,8 @@
 """The timetable of a running plant: calibrations requested at times of day or at intervals.
 
-When an entry is due, it requests its heliostats as an operator would, so they precede all
-heliostats that the schedule would choose. The timetable in the plant file is in force until an
-operator activates another one, which survives a restart.
+When an entry is due, the timetable requests its heliostats as an operator would, so they come
+before all heliostats that the schedule would choose. The timetable in the plant file is in force
+until an operator activates another one, which survives a restart.
 """
 
 import json
@@ -71,7 +71,7 @@ class Timetable:
             self._entries = entries
 
     def put(self, person: Person, entries: Sequence[TimetableEntry] | None) -> None:
-        """Put a timetable in force; None restores that of the plant file.
+        """Activate a timetable; None restores the timetable of the plant file.
 
         Raises
         ------
@@ -99,7 +99,7 @@ class Timetable:
                 self._ask(entry, ask)
 
     def ruled(self, rule: str) -> npt.NDArray[np.bool_]:
-        """Return a mask of the heliostats under a rule of the entries in force, (N,)."""
+        """Return a mask of the heliostats to which a rule in the timetable applies, (N,)."""
         named = [n for entry in self._entries if entry.rule == rule for n in entry.heliostats]
         mask = np.zeros(len(self._plant.field.names), dtype=np.bool_)
         mask[[self._plant.field.place(name) for name in named]] = True

@@ -28,7 +28,7 @@ _LATELY = 86_400.0
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity that has a trend: its name, its unit, and whether each heliostat has its own."""
+    """A quantity that has a trend: its name, its unit, and whether it exists per heliostat."""
 
     name: str
     unit: str
@@ -42,7 +42,7 @@ class Trend:
     Attributes
     ----------
     quantity, unit, heliostat
-        Name and unit of the quantity, and the heliostat; "": the plant.
+        Name and unit of the quantity, and the heliostat ("": the quantity belongs to the plant).
     at
         Middle of each interval with values, POSIX s, (K,).
     low, mean, high
@@ -86,9 +86,9 @@ def trend(
     Parameters
     ----------
     records, archive
-        The store, and the folder of the telemetry; None: there is none.
+        The store, and the folder of the telemetry; None: no telemetry is archived.
     quantity, heliostat
-        Name of the quantity, and the heliostat; "": the plant.
+        Name of the quantity, and the heliostat ("": the quantity belongs to the plant).
     since, until
         POSIX s.
     points
@@ -128,7 +128,7 @@ def trend(
 def thinned(
     at: FloatArray, values: FloatArray, since: float, until: float, points: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return times, minima, means and maxima of the equal intervals that contain values, (K,)."""
+    """Return times, minima, means and maxima, (K,), for the equal intervals that contain values."""
     known = np.isfinite(values)
     at, values = at[known], values[known]
     if len(at) <= points:

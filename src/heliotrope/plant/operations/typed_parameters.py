@@ -1,8 +1,9 @@
 """Error parameters that an operator enters where calibration is impossible: show, set, restore.
 
-They become a version of the heliostat's calibration without sightings, and are written by the same
-route as calibrations: at rest, where the old and the new beam are clear, and compared afterwards.
-The next fit replaces them. Earlier versions come from the store.
+They become a version of the heliostat's calibration without sightings. They are written in the same
+way as calibrations: at rest, where the beam is clear under the old and the new parameters;
+afterwards the stored parameters are compared. The next fit replaces them. Earlier versions come
+from the store.
 """
 
 from collections.abc import Collection, Mapping
@@ -38,7 +39,7 @@ ASKED = (0.2, 5.0)
 
 @dataclass(frozen=True)
 class ParameterState:
-    """A parameter: deviation from the nominal mechanism, in the plant file and in use, and σ."""
+    """A parameter: deviation from the nominal mechanism, in the plant file and in use; and σ."""
 
     name: str
     unit: str
@@ -50,7 +51,7 @@ class ParameterState:
 
 @dataclass(frozen=True)
 class EarlierParameters:
-    """A version of a heliostat's parameters: POSIX s, person, note, sightings, values by name."""
+    """A version of a heliostat's parameters: time (POSIX s), person, note, sightings, values."""
 
     version: int
     at: float
@@ -69,7 +70,7 @@ class ParametersView:
     heliostat, version
         Name, and the version in use; 0 before the first.
     stored
-        Whether the local controller stores what is in use, in words.
+        Whether the local controller stores the parameters in use, in words.
     parameters
         Each parameter.
     earlier
@@ -96,7 +97,7 @@ class PreparedChange:
         The calibration with the new parameters; time, person and version are set when it is
         written.
     items
-        Items that change on the board, with their bytes.
+        Items that the change writes to the board, with their bytes.
     shown, reason
         The change in words, and the author's reason.
     """
@@ -128,7 +129,7 @@ class TypedParameters:
     plant, log
         The controller, and the logbook for events.
     records
-        The store with the earlier versions; None: there are none.
+        The store with the earlier versions; None: there is no store.
     most
         Largest deviation that may be set, in standard deviations of the prior.
     """
@@ -177,7 +178,7 @@ class TypedParameters:
         )
 
     async def compare(self, heliostat: str, first: int, second: int) -> ParameterComparison:
-        """Compare two versions of a heliostat's parameters; 0: those of the plant file.
+        """Compare two versions of a heliostat's parameters; version 0 is the plant file.
 
         Raises
         ------
@@ -223,8 +224,8 @@ class TypedParameters:
     ) -> tuple[float, float]:
         """Return how far a beam moves at its aim between two sets of parameters, m.
 
-        RMS and maximum over the sun positions of this day; NaN if it can track none. See
-        `beam_change`.
+        Returns RMS and maximum over the sun positions of this day; NaN if the heliostat can track
+        at none of them. See `beam_change`.
         """
         nominal = self._plant.beliefs.nominal(heliostat)
         machines = [nominal.with_parameters(each) for each in (first, second)]
@@ -263,7 +264,7 @@ class TypedParameters:
         return self._plant.clock.utc().timestamp()
 
     def in_use(self, heliostat: str) -> dict[str, float]:
-        """Return the parameters in use of a heliostat, by name."""
+        """Return the parameters that a heliostat uses, by name."""
         record = self._plant.beliefs.record(heliostat)
         return self._file(heliostat) if record is None else record.parameters
 
@@ -289,7 +290,7 @@ class TypedParameters:
         Raises
         ------
         RefusedError
-            If it is not accepted.
+            If the change is not accepted.
         InputError, UnknownNameError
             See `prepare`.
         """
@@ -354,7 +355,10 @@ class TypedParameters:
         values: Mapping[str, float],
         typed: Collection[str],
     ) -> HeliostatCalibration:
-        """Return a record of values; typed values have the uncertainty of a new installation."""
+        """Return a calibration record with the values.
+
+        Typed values have the uncertainty of a new installation.
+        """
         last, names = self._plant.beliefs.record(heliostat), tuple(values)
         prior = np.array([mechanism.parameter(name).prior for name in names])
         covariance = np.diag(prior**2)

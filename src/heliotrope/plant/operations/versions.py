@@ -18,7 +18,7 @@ _DAY = 86_400.0
 
 @dataclass(frozen=True)
 class ParameterVersion:
-    """A version: its number (0: the plant file), POSIX s, person, note and number of sightings."""
+    """A version: number (0: the plant file), time (POSIX s), person, note, number of sightings."""
 
     version: int
     at: float
@@ -29,7 +29,7 @@ class ParameterVersion:
 
 @dataclass(frozen=True)
 class ComparedParameter:
-    """A parameter in two versions with its standard deviations; NaN where it is not fitted."""
+    """A parameter in two versions, with standard deviations; NaN where it is not fitted."""
 
     name: str
     unit: str
@@ -52,11 +52,11 @@ class ParameterComparison:
     first, second
         The versions.
     parameters
-        Each parameter in both.
+        Each parameter in both versions.
     beam_rms, beam_most
         How far a beam that the first version puts on its aim misses the aim under the second
-        version, m: RMS and maximum over this day's sun positions above 10°. NaN if it can track
-        none.
+        version, m: RMS and maximum over this day's sun positions above 10°; NaN if the heliostat
+        can track at none of these positions.
     """
 
     heliostat: str

@@ -1,4 +1,4 @@
-"""Views of a running plant: the field as one table, one heliostat, an emergency."""
+"""Views of a running plant: the field as a table, a single heliostat, an emergency."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ from heliotrope.store.records import Kind
 
 #: Time for which a frame is reused, s of plant time.
 _EVERY = 1.0
-#: An aim at up to this many half diagonals from the centre of a surface counts as on it.
+#: An aim within this many half diagonals of the centre of a surface counts as on the surface.
 _NEAR = 1.0
 #: Supply voltage of a board that has not reported it yet, mV.
 _UNTOLD = 0
@@ -43,7 +43,7 @@ class Viewer:
     Attributes
     ----------
     positions, sizes
-        ENU, m, (N, 3); width and height, m, (N, 2).
+        Positions of the heliostats, ENU, m, (N, 3); width and height of their mirrors, m, (N, 2).
     aim_names
         Places where a beam can be: "" for nowhere, receivers, targets, "elsewhere".
     """
@@ -164,7 +164,7 @@ class Viewer:
         )
 
     def _parameters(self, name: str) -> dict[str, ParameterView]:
-        """Return the parameters of a mechanism; those never calibrated with their priors."""
+        """Return the parameters of a mechanism; parameters never calibrated have their prior σ."""
         group, row = self._plant.design.find(name)
         record = self._plant.beliefs.record(name)
         if record is None:

@@ -31,20 +31,21 @@ class FieldFrame:
     at
         POSIX s.
     state
-        States of `lcu.states`, `STALE_STATE` where unknown, uint8, (N,).
+        States of `lcu.states`, uint8, (N,); `STALE_STATE` where a state is unknown.
     fault, flags
         Codes from `lcu.names`, uint8 and uint32, (N,).
     age
-        Age of all values of the row, s, float32, (N,); infinite if never heard.
+        Age of the heliostat's reported values, s, float32, (N,); infinite if it never reported.
     counts
         Step counts of the two axes, int32, (N, 2).
     error
         Predicted standard deviation of the normal, two-dimensional, rad, float32, (N,); NaN before
         the first calibration.
     measured
-        Tracking error in the photographs of the last visit, rad, float32, (N,); NaN before.
+        Tracking error in the photographs of the last visit, rad, float32, (N,); NaN before the
+        first visit.
     calibrated_at
-        Time of the last calibration, POSIX s, (N,); NaN before.
+        Time of the last calibration, POSIX s, (N,); NaN before the first calibration.
     sightings
         Number of known sightings, int32, (N,).
     cluster
@@ -76,7 +77,7 @@ class FieldFrame:
 
 @dataclass(frozen=True)
 class SunView:
-    """The sun at a time: unit vector (3,), azimuth and elevation, rad."""
+    """The sun at one time: unit vector, (3,); azimuth and elevation, rad."""
 
     at: datetime
     direction: FloatArray
@@ -86,7 +87,7 @@ class SunView:
 
 @dataclass(frozen=True)
 class ParameterView:
-    """One parameter of a mechanism, SI and rad, with its standard deviation and nominal value."""
+    """One parameter of a mechanism, SI or rad, with its standard deviation and nominal value."""
 
     value: float
     sigma: float
@@ -106,7 +107,7 @@ class DriveView:
 
 @dataclass(frozen=True)
 class SightingView:
-    """One sighting: POSIX s, target, beam error under the calibration of that time, rad."""
+    """One sighting: time (POSIX s), target, beam error under the calibration of that time, rad."""
 
     at: float
     target: str
@@ -128,13 +129,13 @@ class HeliostatView:
     live, age, state, fault, flags
         As in `field_state.HeliostatState`.
     supply, temperature, boots
-        V, °C, and restarts; NaN, NaN, 0 if not live.
+        Supply voltage, V; temperature, °C; number of restarts. NaN, NaN, 0 if not live.
     drives
         Its two drives; () if not live.
     aim, standby
         ENU, m, (3,); NaN if not assigned.
     on
-        Receiver or target that it aims at, "" for none.
+        Receiver or target at which the heliostat aims; "" if there is none.
     parameters
         Parameters of its mechanism, by name.
     calibration
@@ -199,7 +200,7 @@ class ClusterRow:
     connected
         Whether its link is up.
     heliostats, live
-        Number of its heliostats, and of those that reported within the limit.
+        Number of its heliostats, and number of heliostats that reported within the limit.
     cycle
         Duration of the last poll of its bus, s; NaN if unknown.
     answered
@@ -215,7 +216,7 @@ class ClusterRow:
     acts
         Actions that its safety table demands.
     problem
-        Problem with its link, "" if none.
+        Problem with its link; "" if there is none.
     """
 
     name: str
@@ -244,7 +245,7 @@ class AlarmRow(Alarm):
     at
         When it was raised, POSIX s.
     acknowledged_by
-        Person who has acknowledged it, "" if nobody has.
+        Person who has acknowledged the alarm; "" if nobody has.
     count
         Number of times it was raised.
     """
@@ -256,11 +257,10 @@ class AlarmRow(Alarm):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PredictedView(FluxView):
-    """The flux that is expected on a receiver, and its uncertainty.
+    """The predicted flux on a receiver, and its uncertainty.
 
-    Standard deviations cover only the errors of the heliostats' calibrations: see
-    `heliotrope.aims.errors`. The uncertainty of irradiance, reflectivity and soiling comes in
-    addition.
+    The standard deviations cover only the errors of the heliostats' calibrations (see
+    `heliotrope.aims.errors`), and not the uncertainty of irradiance, reflectivity and soiling.
 
     Attributes
     ----------
@@ -289,7 +289,8 @@ class EventRow:
     Attributes
     ----------
     at, kind, who, text
-        POSIX s; command, calibration, authority or plant; person; one line.
+        Time, POSIX s; "command", "calibration", "authority" or "plant"; person; the event in one
+        line.
     number
         Number of the event, since the start of the plant.
     heliostats
@@ -306,7 +307,7 @@ class EventRow:
 
 @dataclass(frozen=True)
 class PacketRow:
-    """One message on a link: POSIX s, cluster, "to" or "from" it, kind, bytes, and its text."""
+    """One message on a link: time (POSIX s), cluster, "to" or "from" it, kind, bytes, text."""
 
     at: float
     cluster: str
@@ -335,7 +336,7 @@ class BusFrame:
     signed
         Whether it is signed with the bus key.
     text
-        Its fields; the bytes in hexadecimal if the frame cannot be decoded.
+        The fields of the frame; its bytes in hexadecimal if it cannot be decoded.
     """
 
     at: float
@@ -362,7 +363,7 @@ class Button(StrEnum):
 
 @dataclass(frozen=True)
 class LastOrder:
-    """The last command to a heliostat: POSIX s, person or part of the plant, name, and result."""
+    """The last command to a heliostat: time (POSIX s), who gave it, name, and result."""
 
     at: float
     who: str
@@ -404,7 +405,8 @@ class Explanation:
 class Running:
     """A calibration visit in progress.
 
-    Heliostat, target, present stage, start (POSIX s), and the other heliostats of a joint visit.
+    The fields are the heliostat, the target, the present stage, the start (POSIX s), and the other
+    heliostats of a joint visit.
     """
 
     heliostat: str
@@ -419,7 +421,7 @@ class Running:
         return (self.heliostat, *self.others)
 
     def without(self, heliostats: Collection[str]) -> "Running | None":
-        """Return the visit without some heliostats, None if none remain."""
+        """Return the visit without some heliostats; None if no heliostat remains."""
         left = tuple(name for name in self.heliostats if name not in heliostats)
         return replace(self, heliostat=left[0], others=left[1:]) if left else None
 
@@ -435,12 +437,13 @@ class CalibrationEntry:
     heliostat, target
         Names.
     outcome
-        Whether the heliostat has a new calibration, or why not.
+        Whether the heliostat has a new calibration, or why it has none.
     before, after
         Beam error over all sightings of the heliostat, under the earlier calibration and after the
         fit, rad RMS; NaN without a fit.
     measured
-        Beam error of this visit's photographs under the earlier calibration, rad RMS; NaN if none.
+        Beam error of this visit's photographs under the earlier calibration, rad RMS; NaN if there
+        are no photographs.
     predicted
         Predicted standard deviation of the normal after the visit, rad; NaN if never calibrated.
     truth_before, truth_after
@@ -507,8 +510,8 @@ class CalibrationView:
     on
         Whether calibration is running; if not, ``reason`` says why.
     done, waiting, failed
-        Number of calibrated heliostats, of the remaining heliostats, and of visits without a new
-        calibration.
+        Number of calibrated heliostats, number of remaining heliostats, and number of visits
+        without a new calibration.
     running
         Visits in progress.
     results
@@ -581,9 +584,9 @@ class FlightView:
     orientations, heliostats
         Number of measured orientations and of heliostats.
     in_use, at_stow, at_target, unchanged
-        Number of heliostats whose parameters in use include the flight, that receive new parameters
-        when next at stow, whose large change waits for a photograph on a target, and whose fit was
-        rejected or was no better.
+        Number of heliostats whose parameters in use include the flight; number that receive new
+        parameters when next at stow; number whose large change waits for a photograph on a target;
+        number whose fit was rejected or was no better.
     shared
         The errors shared by all records of the flight: name, value and standard deviation.
     problems
@@ -618,7 +621,8 @@ class LearningView:
     heliostats, sightings
         Number of heliostats and sightings from which they were learnt.
     gain
-        Increase in the log probability density of a photograph predicted from the earlier ones.
+        Increase in the log probability density of a photograph predicted from the earlier
+        photographs.
     drift
         Drift, steps and noise in force, in words.
     said
@@ -649,9 +653,9 @@ class TimetableRow:
     at
         Times of day with their zone, as "08:30Z".
     every_s
-        Interval, s, from midnight UTC; None: there is none.
+        Interval, s, from midnight UTC; None: there is no interval.
     next, last
-        When the entry is due next, and was due last, POSIX s; NaN before the first time.
+        When the entry is due next, and when it was due last, POSIX s; NaN before the first time.
     text
         Outcome of the last time.
     rule
@@ -683,11 +687,12 @@ class CameraView:
     at
         POSIX s.
     jpeg
-        The picture with the findings drawn in; b"" before the first.
+        The picture with the findings drawn in; b"" before the first photograph.
     reading
         The software's findings, line by line.
     centroid
-        Beam centroid, right of and above the target's centre, m; None if not seen.
+        Beam centroid, as offsets right of and above the target's centre, m; None if no beam was
+        seen.
     """
 
     target: str
@@ -707,25 +712,25 @@ class EmergencyView:
     on
         Whether it is active.
     act, who, reason
-        DEFOCUS or STOW; the users whose orders are in force, and the safety table; and the reason,
-        or how the emergency ends once every order is withdrawn. After the emergency: who gave the
-        order, and why. "" if there was no order.
+        DEFOCUS or STOW; the users whose orders are in force, and the safety table if it requires
+        the order; and the reason, or how the emergency ends once every order is withdrawn. After
+        the emergency: who gave the order, and why. "" if there was no order.
     seconds
         Time since the order, s.
     heliostats, acknowledged, done
-        Number of heliostats ordered, that acknowledged the order, and that have verifiably carried
-        it out.
+        Number of heliostats ordered, number that acknowledged the order, and number that have
+        verifiably carried it out.
     not_done
         Names of the first heliostats that have not verifiably carried it out.
     text
-        The same in words.
+        The state of the order, in words.
     calls
         The orders of users that have not been withdrawn, one per user.
     measured
         Whether a sensor has shown since the order that the flux on the receiver is below its limit.
     followed
-        Number of heliostats done whose mirrors demonstrably followed their drives earlier today, by
-        type of evidence.
+        Of the heliostats counted as done, the number whose mirrors demonstrably followed their
+        drives earlier today, by type of evidence.
     believed, believed_count
         Names of the first heliostats counted as done only by their reports, and the number of all
         such heliostats.
@@ -776,7 +781,7 @@ class Summary:
     emergency
         Whether an emergency is active.
     resume
-        Why automatic control waits for an operator's Resume, "" if it does not.
+        Why automatic control waits for an operator's Resume; "" if it does not wait.
     pace
         Seconds of plant time per second over the last half minute: 1 for a real plant.
     readings

@@ -1,8 +1,8 @@
 """ZERO and LOCK POSITION: an operator declares the axis positions of one heliostat.
 
 ZERO takes step counts. LOCK POSITION (Malan, table D.1, 0xD4) takes the aim at which the operator
-sees the beam; the counts become those that the calibrated heliostat would have now with its beam at
-that aim.
+sees the beam; the counts are then set to the values that the calibrated heliostat would have now
+with its beam at that aim.
 """
 
 import functools
@@ -34,7 +34,7 @@ def zero(
     """Declare the step counts of both axes of one heliostat that is locked or has a fault.
 
     Nothing moves; the local controller stores the counts. This requires an engineer, and the
-    heliostat's key in its cluster.
+    heliostat's key stored in its cluster.
 
     Parameters
     ----------

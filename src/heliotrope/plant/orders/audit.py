@@ -49,15 +49,16 @@ class Record:
     who, role
         The person, or the part of the plant, that gave the command.
     what, values
-        Name of the command and its values; if groups have different values, see ``note``.
+        Name of the command, and its values; if groups of heliostats have different values, ``note``
+        lists them.
     heliostats
-        Names; () for all.
+        Names of the heliostats; () for all heliostats.
     at
         Time of acceptance, UTC, ISO 8601.
     note
         Reason or details.
     result, finished
-        The result and its time; "" until then.
+        The result, and the time of the result; both "" until there is a result.
     """
 
     identity: str
@@ -111,20 +112,21 @@ class Forgetful:
 class JsonLines:
     """An audit in a single append-only file, line by line.
 
-    The lines form a hash chain: each has the digest of its content and of the previous line; see
-    `verify`. Lines from earlier programs have no digest; the first digest covers all of them.
+    The lines form a hash chain: each line has a digest of its content and of the previous line; see
+    `verify`. Lines from earlier programs have no digest; the first digest covers all such lines.
 
     Parameters
     ----------
     path
         The file, created if it does not exist. Only one process at a time may open it.
     started
-        Start time, UTC, written to records that are completed now because the plant had stopped.
+        Start time, UTC, written to records that are completed only now because the plant had
+        stopped.
 
     Raises
     ------
     AuditError
-        If it cannot be opened, or another process has it.
+        If the file cannot be opened, or another process has it open.
     FormatError
         If its records contradict each other.
     """
@@ -197,12 +199,12 @@ class JsonLines:
         self._open.discard(identity)
 
     def confirm(self) -> None:
-        """Check that a record could be written now, that is, the disk syncs and has space.
+        """Check that a record could be written now: the disk syncs and has space.
 
         Raises
         ------
         AuditError
-            If it could not.
+            If a record could not be written.
         """
         try:
             os.fsync(self._file)
@@ -291,7 +293,7 @@ def read(path: str | Path) -> tuple[list[Record], int]:
 
 
 def _repeats(known: Record, event: str, fields: dict[str, Any]) -> bool:
-    """Whether a line repeats a known one."""
+    """Whether a line repeats a record that is already known."""
     if event == "result":
         return bool(known.result == fields["result"])
     names = ("who", "what", "at")
@@ -302,7 +304,7 @@ def _repeats(known: Record, event: str, fields: dict[str, Any]) -> bool:
 
 
 def _fields(line: bytes) -> dict[str, Any] | None:
-    """Return the fields of a line, None if it was torn by a power failure."""
+    """Return the fields of a line; None if a power failure left the line incomplete."""
     try:
         found = json.loads(line)
     except ValueError:
@@ -311,13 +313,16 @@ def _fields(line: bytes) -> dict[str, Any] | None:
 
 
 def _before(data: bytes) -> str:
-    """Return the digest that precedes the first one in the file; it covers all lines without."""
+    """Return the digest before the first digest in the file.
+
+    The returned digest covers all lines that have none.
+    """
     older = data.rstrip(b"\n")
     return hashlib.sha256(older).hexdigest() if older else GENESIS
 
 
 def _last_digest(data: bytes) -> str:
-    """Return the digest of the last complete line that has one, even if the chain is broken."""
+    """Return the digest of the last complete line with a digest, even if the chain is broken."""
     for line in reversed(data.split(b"\n")):
         fields = _fields(line)
         if fields is not None and isinstance(fields.get("digest"), str):
@@ -326,13 +331,15 @@ def _last_digest(data: bytes) -> str:
 
 
 def verify(path: str | Path, known: Iterable[Head] = ()) -> Head:
-    """Check the hash chain of an audit file, and that known heads are in it; return its head.
+    """Check the hash chain of an audit file; return its head.
+
+    Known heads of the chain must be in it.
 
     Raises
     ------
     FormatError
-        If a line does not fit, or a head is not in the chain; the text names the first such line or
-        head.
+        If a line does not fit the chain, or a head is not in the chain; the text names the first
+        such line or head.
     """
     data, place = Path(path).read_bytes(), 0
     digests: list[str] = []

@@ -8,9 +8,9 @@ another person may also seize it.
 
 A visit works under a `Mandate`, which the holder grants at its start and which is valid until the
 visit ends, whoever takes command in the meantime. It covers only the heliostats of the visit, and
-an operator's command to one of them removes that heliostat. Commands under a mandate are sent with
-the current token; while nobody holds the authority and a mandate is open, the plant has its own
-token.
+an operator's command to one of these heliostats removes it from the visit. Commands under a mandate
+are sent with the current token; while nobody holds the authority and a mandate is open, the plant
+has its own token.
 
 DEFOCUS and STOW need no authority, no role and no token.
 """
@@ -41,7 +41,7 @@ __all__ = [
 
 
 class TakenOutError(RefusedError):
-    """The end of a visit whose heliostats have been removed from it by other orders."""
+    """A visit ends because other orders have removed all its heliostats."""
 
 
 class Role(IntEnum):
@@ -58,7 +58,7 @@ class Role(IntEnum):
 
     @property
     def acknowledges_as(self) -> safety.AcknowledgeRole:
-        """The role in the safety table, where an engineer acts as supervisor; a viewer has none."""
+        """The role in the safety table: an engineer acts as supervisor, a viewer has no role."""
         return {
             Role.OPERATOR: safety.AcknowledgeRole.OPERATOR,
             Role.ENGINEER: safety.AcknowledgeRole.SUPERVISOR,
@@ -149,8 +149,8 @@ class Mandate:
     taken
         Why heliostats were removed, by name.
     blameless
-        Heliostats that did not cause their removal themselves: removed by an operator's order or an
-        emergency.
+        Heliostats that did not cause their own removal: an operator's order or an emergency removed
+        them.
     ended
         Why all commands under it are refused; "" while it is valid.
     """
@@ -166,9 +166,9 @@ class Mandate:
     def take_out(
         self, heliostats: Iterable[str], why: str, *, fault: bool = False
     ) -> tuple[str, ...]:
-        """Remove heliostats for a reason ``why``; return those that were covered.
+        """Remove heliostats for a reason ``why``; return the removed heliostats.
 
-        With ``fault`` the heliostats caused the order themselves.
+        With ``fault``, the heliostats themselves caused the order.
         """
         names = tuple(name for name in heliostats if name in self.heliostats)
         self.heliostats.difference_update(names)
@@ -182,7 +182,7 @@ class Mandate:
         self.heliostats.difference_update(heliostats)
 
     def refused(self, heliostats: Iterable[str]) -> dict[str, str]:
-        """Return the heliostats that may not be commanded under it, and their reasons."""
+        """Return the heliostats that may not be commanded under the mandate, and the reasons."""
         return {
             name: self.ended or self.taken.get(name, "it is not in this visit")
             for name in heliostats
@@ -240,7 +240,7 @@ class Authority:
 
     @property
     def grant(self) -> Grant | None:
-        """The present holder's grant, None if nobody holds the authority."""
+        """The present holder's grant; None if nobody holds the authority."""
         grant = self._grant
         if grant is not None and not self._clock.monotonic() - grant.kept < self.lifetime:
             self._give_up()
@@ -381,7 +381,7 @@ class Authority:
                 self._own, self._last_kept = 0, self._clock.monotonic()
 
     def mandate_of(self, token: int) -> Mandate | None:
-        """Return the open mandate for a token, None if there is none."""
+        """Return the open mandate for a token; None if there is none."""
         return self._mandates.get(token)
 
     def visited(self) -> dict[str, Mandate]:
@@ -415,9 +415,9 @@ class Authority:
         return frozenset() if token == self.token else frozenset(heliostats)
 
     def left(self, token: int, heliostats: Iterable[str]) -> frozenset[str]:
-        """Return the heliostats that no mandate covers any longer under a token.
+        """Return the heliostats that are no longer covered by the mandate with a given token.
 
-        A visit that has been told to end still keeps its heliostats, because it moves their beams
+        A visit that has been told to end still covers its heliostats, because it moves their beams
         off.
         """
         mandate = self._mandates.get(token)
@@ -444,7 +444,10 @@ class Authority:
         return token
 
     def _give(self, person: Person) -> Grant:
-        """Grant the authority; a person who is the only one with open visits keeps their token."""
+        """Grant the authority to a person.
+
+        The token stays the same if all open visits are this person's.
+        """
         now, token = self._clock.monotonic(), self._own
         if not token or any(each.person != person for each in self._mandates.values()):
             token, self.changed_at = self._drawn(), now
@@ -453,7 +456,10 @@ class Authority:
         return self._grant
 
     def _give_up(self) -> None:
-        """End the grant. Open mandates continue under a token of the plant itself."""
+        """End the grant.
+
+        Open mandates continue under a token of the plant itself.
+        """
         self._grant, self.changed_at = None, self._clock.monotonic()
         self._own = self._drawn() if self._mandates else 0
 

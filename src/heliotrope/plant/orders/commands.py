@@ -54,11 +54,11 @@ class NewPoints:
     note
         Called with the heliostats whose points are being assigned, and the points.
     check
-        Called with the heliostats whose turn it is; raises `RefusedError` if their points may no
+        Called with the heliostats whose turn has come; raises `RefusedError` if their points may no
         longer be assigned.
     free
-        Returns the heliostats that need not wait for a turn; None: the heliostats that bring no
-        light to a receiver.
+        Returns the heliostats that need not wait for a turn; None: heliostats that bring no light
+        to a receiver need not wait.
     """
 
     name: str
@@ -76,7 +76,7 @@ class NewPoints:
         return self.points[np.array([row[name] for name in names], dtype=np.intp)]
 
     def grouped(self, names: Iterable[str]) -> dict[tuple[float, ...], list[str]]:
-        """Return the heliostats for each point, which share one command."""
+        """Group the heliostats by point; heliostats with the same point share one command."""
         some = tuple(names)
         return grouped(some, self.of(some))
 
@@ -155,12 +155,14 @@ class Commands:
         token: int,
         again: bool,
     ) -> None:
-        """Send a recorded command; one that waited for its record (``again``) is examined again.
+        """Send a recorded command.
+
+        A command that waited for its record (``again``) is examined again.
 
         Raises
         ------
         RefusedError
-            If it may no longer be sent.
+            If the command may no longer be sent.
         """
         name, waiting = ticket.name, ticket.waiting(heliostats)
         if again and waiting:
@@ -194,9 +196,10 @@ class Commands:
     ) -> Ticket:
         """Return the ticket of a command that may be issued; its record goes to the disk.
 
-        The ticket ends at once for ``blocked`` heliostats. An operator's command removes the others
-        from their visits. While a visit verifies new parameters, no operator may send the beam to
-        an aim, because only the visit can tell whether the beam arrives there.
+        The ticket ends at once for ``blocked`` heliostats. An operator's command removes all other
+        heliostats of the ticket from their visits. While a visit verifies new parameters, no
+        operator may send the beam to an aim, because only the visit can tell whether the beam
+        arrives there.
 
         Raises
         ------
@@ -231,12 +234,12 @@ class Commands:
         return ticket
 
     def _lock_record(self, heliostats: tuple[str, ...], token: int) -> tuple[Work, Work]:
-        """Return disk work that records the owner of a lock before locking, and its reversal."""
+        """Return disk work that records who owns a lock before locking, and its reversal."""
         visit = self._authority.mandate_of(token) is not None
         return self._proofs.points.holding(self._locks.record(heliostats, visit=visit))
 
     def _note_lock(self, heliostats: tuple[str, ...], token: int) -> None:
-        """Record the owner of a lock: an operator, or a visit, whose lock the plant removes."""
+        """Record who owns a lock: an operator or a visit; the plant removes a visit's lock."""
         if self._authority.mandate_of(token) is None:
             self._locks.forget(heliostats)
         else:
@@ -245,12 +248,12 @@ class Commands:
     def examine(
         self, name: str, numbers: tuple[float, ...], names: tuple[str, ...], token: int = 0
     ) -> tuple[tuple[str, ...], dict[str, str]]:
-        """Return the heliostats that may be sent a command now, and why the others may not.
+        """Return the heliostats that may be sent a command now, and why the rest may not.
 
         Raises
         ------
         BeamError
-            If none of them may.
+            If no heliostat may be sent the command.
         """
         asked = Asked(name, names, token=token)
         able, refused = self._guards.passed(asked, NOT_NOW, BEAM_REFUSED)
@@ -263,7 +266,7 @@ class Commands:
         """Declare the step counts of the axes of one heliostat that is locked or has a fault.
 
         Nothing moves; its local controller stores the counts. This requires an engineer, and the
-        heliostat's key in its cluster.
+        heliostat's key stored in its cluster.
 
         Parameters
         ----------
@@ -334,8 +337,8 @@ class Commands:
     def move(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
         """Move beams slightly on their receiver for a measurement; their aims stay assigned.
 
-        The plant returns the beams to their aims by itself; see `movements`. They need not wait for
-        a turn, because they bring no additional light to the receiver.
+        The plant returns the beams to their aims by itself; see `movements`. The heliostats need
+        not wait for a turn, because they bring no additional light to the receiver.
 
         Parameters
         ----------
@@ -376,11 +379,11 @@ class Commands:
 
     @property
     def aimed(self) -> frozenset[str]:
-        """The heliostats whose new aim waits for the disk or for its turn."""
+        """The heliostats whose new aim is waiting for the disk or for its turn."""
         return self._joining.waiting("AIM") | self._orders.unstored("AIM")
 
     def holding(self, held: Held) -> tuple[Work, Work]:
-        """Return work that stores what a visit takes, and its reversal; see `Points.holding`."""
+        """Return disk work that stores what a visit takes, and the reversal: `Points.holding`."""
         return self._proofs.points.holding(held)
 
     def _places(self, names: Sequence[str]) -> npt.NDArray[np.intp]:
@@ -392,7 +395,10 @@ class Commands:
     def _pointed(
         self, name: str, points: Mapping[str, npt.ArrayLike]
     ) -> tuple[tuple[str, ...], npt.NDArray[np.intp], FloatArray, dict[str, str]]:
-        """Return heliostats, rows (K,), points (K, 3), and why others are out of service."""
+        """Return the heliostats that may get points, their indices (K,), and their points (K, 3).
+
+        Also return why the remaining heliostats are out of service.
+        """
         goals = points_of(name, points) if name == "AIM" else None
         able, out = self._guards.passed(Asked(name, tuple(points), goals), OUT_OF_SERVICE)
         points = {n: points[n] for n in able}
@@ -402,7 +408,7 @@ class Commands:
     def storing(
         self, name: str, names: tuple[str, ...], places: FloatArray, held: Held = NOTHING
     ) -> Storing:
-        """Return work that stores points (K, 3) and what visits then hold, and its reversal."""
+        """Return disk work that stores points (K, 3) and what visits hold, and its reversal."""
         return self._proofs.points.storing(name, self._places(names), places, held)
 
     def _lent(self, names: tuple[str, ...], places: FloatArray) -> Held:
@@ -412,7 +418,7 @@ class Commands:
     def give_points(
         self, new: NewPoints, accept: Callable[[tuple[Work, Work] | None], Ticket]
     ) -> Ticket:
-        """Issue points that have been checked; each is stored, and assigned when it is sent.
+        """Issue points that have been checked; each is stored, then assigned when it is sent.
 
         Parameters
         ----------
@@ -500,7 +506,7 @@ class Commands:
         Raises
         ------
         BeamError
-            If a heliostat may not.
+            If a heliostat may not be assigned its point.
         """
         rows = self._places(names)
         tracking = self._field.among(states.ON_AIM, self._now())[rows]
@@ -513,9 +519,9 @@ class Commands:
     def _stays(self, rows: npt.NDArray[np.intp], places: FloatArray) -> npt.NDArray[np.bool_]:
         """Return a mask of the heliostats that new points (K, 3) keep off receivers, (K,).
 
-        The aim and the new point lie on the same target, or near each other and off every receiver.
-        The second case occurs if a beam misses its target and is therefore sent to a point beside
-        it.
+        Light stays off the receivers if the present aim and the new point lie on the same target,
+        or near each other and off every receiver. The second case occurs if a beam misses its
+        target and is therefore sent to a point beside the target.
         """
         aims = self._proofs.points.aims[rows]
         stays = np.linalg.norm(places - aims, axis=-1) <= _BESIDE

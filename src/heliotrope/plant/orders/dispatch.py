@@ -72,11 +72,14 @@ class JoinDispatcher(Part):
         self._orders.command(job.ticket, job.name, values, heliostats, token, self._life, again)
 
     def _wait_again(self, job: JoiningJob, heliostats: tuple[str, ...]) -> None:
-        """Queue heliostats again whose cluster refused an outdated token."""
+        """Queue again the heliostats whose cluster refused an outdated token."""
         self._queue.put(replace(job, waiting=deque(heliostats)))
 
     def _clear(self, job: JoiningJob, part: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the heliostats whose turn has come and that may go; end the ticket for others."""
+        """Return the heliostats whose turn has come and that may go.
+
+        The ticket ends for heliostats that may not go.
+        """
         try:
             if job.name in messages.SLICED:
                 blocked = self._examine(job.name, job.values, part)[1]

@@ -1,8 +1,8 @@
 """Restores what visits have taken (moved aims, locks and fine steps) once no visit holds it.
 
-A visit restores what it took. Whatever is left when it ends, or when an operator's order removes a
-heliostat from it, the plant restores itself, under whatever command authority exists, as soon as
-motions are accepted.
+A visit restores what it took. If a visit ends without doing so, or an operator's order removes a
+heliostat from the visit, the plant restores the rest itself, under whatever command authority
+exists, as soon as motions are accepted.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -58,7 +58,7 @@ class GivingBack(Part):
         self._stow = stow
 
     def on_beat(self, now: float) -> None:
-        """Restore what is due, as far as motions are accepted now."""
+        """Restore what must be restored, as far as motions are accepted now."""
         self._unlock(now)
         self._bring_back(now)
         self._step(now)
@@ -70,7 +70,7 @@ class GivingBack(Part):
             self._locks.sent(what, self._ordered(what, tuple(names)))
 
     def _ordered(self, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Order heliostats that were left locked; return those that need no other order."""
+        """Order heliostats that were left locked; return heliostats that need no other order."""
         if what == "STOW":
             held = self._guards.reasons(Asked(what, names), NOT_NOW)
             free = tuple(name for name in names if name not in held)
@@ -94,9 +94,9 @@ class GivingBack(Part):
         note: str,
         store: tuple[Work, Work] | None = None,
     ) -> tuple[str, ...]:
-        """Issue an order to heliostats and return them, without the blocked ones.
+        """Issue an order to heliostats; return the heliostats that are not blocked.
 
-        The ticket names the blocked heliostats; they are due again later.
+        The ticket names the blocked heliostats; the order to them is tried again later.
         """
         token = self._authority.token
         able = tuple(name for name in names if name not in blocked)

@@ -68,7 +68,10 @@ class Guards:
     aims: FloatArray
 
     def reasons(self, asked: Asked, *kinds: Refusal) -> dict[str, str]:
-        """Return the heliostats that guards block, with given refusals or any, and the reasons."""
+        """Return the heliostats that guards block, and the reasons.
+
+        ``kinds`` restricts the guards to some refusals.
+        """
         found: dict[str, str] = {}
         for guard in GUARDS:
             if guard.refusal in (kinds or (guard.refusal,)) and asked.name in guard.commands:
@@ -79,7 +82,7 @@ class Guards:
         return {name: found[name] for name in asked.heliostats if name in found}
 
     def passed(self, asked: Asked, *kinds: Refusal) -> tuple[tuple[str, ...], dict[str, str]]:
-        """Return the heliostats that the guards pass, and the blocked ones with their reasons.
+        """Return the heliostats that the guards pass, and the blocked heliostats with the reasons.
 
         Raises
         ------
@@ -113,7 +116,7 @@ class Guards:
         return kind.error(what=asked.name, heliostat=first, more=more, reason=reason)
 
     def destined(self, asked: Asked) -> FloatArray | None:
-        """Return the points (K, 3) to which a command sends beams; None: it sends them to none."""
+        """Return the points (K, 3) to which a command sends beams; None if it sends none."""
         if asked.points is not None or asked.name not in TO_AIMS:
             return asked.points
         rows = np.array([self.field.place(name) for name in asked.heliostats], dtype=np.intp)
@@ -160,7 +163,10 @@ def _cluster(reason: Callable[[Guards, str], str | None]) -> Check:
 
 
 def _alarm(condition: str = "", among: tuple[int, ...] = tuple(range(len(states.STATES)))) -> Check:
-    """Block heliostats in some states that a row of the safety table, or any row, keeps away."""
+    """Block heliostats, in some states, that the safety table keeps away.
+
+    ``condition`` selects one row of the table; "" stands for any row.
+    """
 
     def check(plant: Guards, asked: Asked) -> Iterable[str | None]:
         found = plant.sentinel.table.blocked(condition)
@@ -180,7 +186,7 @@ def _unacknowledged(plant: Guards, asked: Asked) -> Iterable[str | None]:
 
 
 def _doubted(plant: Guards, asked: Asked) -> Iterable[str | None]:
-    """Block doubtful heliostats from a receiver; a photograph on a target resolves the doubt."""
+    """Keep doubtful heliostats off receivers; a photograph on a target resolves the doubt."""
     points = plant.destined(asked)
     assert points is not None
     return plant.doubtful.reasons(asked.heliostats, points)

@@ -35,11 +35,11 @@ class JoiningJob:
     Attributes
     ----------
     ticket, name, values, token
-        Parts of the command; the token is that of the authority holder or of a mandate.
+        Parts of the command; the token belongs to the authority holder or to a mandate.
     waiting
         Heliostats still to be sent.
     until
-        Time at which the command is abandoned for them, monotonic s.
+        Time at which the command is abandoned for the waiting heliostats, monotonic s.
     assign
         Assigns the points of heliostats whose turn has come, and sends them; None: the command
         assigns none.
@@ -55,14 +55,15 @@ class JoiningJob:
 
 
 class JoinQueue:
-    """The waiting heliostats: first come, first served, as fast as a `JoinLimiter` admits.
+    """The waiting heliostats: first come, first served, at the rate that a `JoinLimiter` admits.
 
-    Of the heliostats that leave stow, one slice starts at each check.
+    At each check, one slice of the heliostats that leave stow starts.
 
     Parameters
     ----------
     rate, burst
-        Heliostats that may join per second, and at once after a pause.
+        Number of heliostats that may join per second, and number that may join at once after a
+        pause.
     patience
         Longest time that a heliostat waits for its turn, s.
 
@@ -91,7 +92,9 @@ class JoinQueue:
     def admit(
         self, now: float, lost: Lost, *, held: bool = False
     ) -> list[tuple[JoiningJob, tuple[str, ...]]]:
-        """Return the heliostats that may go now, none while ``held``; drop jobs that have ended.
+        """Return the heliostats that may go now; drop jobs that have ended.
+
+        While ``held``, no heliostat may go.
 
         ``lost`` returns the heliostats that may no longer be commanded under the token of their
         job.
@@ -120,7 +123,7 @@ class JoinQueue:
         return admitted
 
     def drop(self, text: str, heliostats: frozenset[str] | None = None, name: str = "") -> None:
-        """Drop waiting heliostats: all, some, or those of one command; ``text`` says why."""
+        """Drop waiting heliostats: all, some, or all of one command; ``text`` says why."""
         for job in self._jobs:
             if name in ("", job.name):
                 self._fail(job, text, heliostats)

@@ -44,17 +44,18 @@ class KeptAudit:
         The computer's clock; its monotonic time limits the silence of the store. (The clock of a
         simulated plant may run faster than the disk.)
     started
-        UTC, written to records that are completed now because the plant had stopped.
+        Start time, UTC, written to records that are completed only now because the plant had
+        stopped.
 
     Attributes
     ----------
     ended
-        Number of those records.
+        Number of records that were completed at the start.
 
     Raises
     ------
     AuditError
-        If those records could not be completed.
+        If the records without a result could not be completed.
     """
 
     def __init__(self, keeper: Keeper, clock: Clock, started: datetime) -> None:
@@ -146,7 +147,7 @@ class KeptPoints:
         self._kept: dict[str, Places] | None = None
 
     def read(self) -> dict[str, Places]:
-        """Return the stored points, by kind; empty if there are none.
+        """Return the stored points, by kind; an empty mapping if there are none.
 
         Raises
         ------
@@ -158,7 +159,7 @@ class KeptPoints:
         return {kind: dict(places) for kind, places in self._kept.items()}
 
     def keep(self, points: Mapping[str, Places]) -> None:
-        """Replace the stored points; the new ones are on the disk when this returns.
+        """Replace the stored points; the new points are on the disk when this returns.
 
         Raises
         ------
@@ -181,7 +182,7 @@ class KeptPoints:
 
 
 def _room(keeper: Keeper) -> str | None:
-    """Return the reason why the disk is full, None if it has space."""
+    """Return the refusal to show if the disk is full; None if it has space."""
     file = keeper.database.file
     if file is None:
         return None

@@ -1,10 +1,10 @@
-"""Aims that visits have moved, and the aims to which the beams return.
+"""The aims that visits have moved, and the aims to which the beams return.
 
 A receiver visit moves beams by a milliradian; a visit to a target gives heliostats an aim there. So
 that the beams return whatever happens to the visit, the plant itself sends each beam back to its
 aim (`giving_back`): when the visit requests it, when a small movement has not been renewed for a
-while, and when the mandate or the command authority under which it was moved has ended. That
-requires a command authority, because clusters accept no other commands.
+while, and when the mandate or the command authority under which it was moved has ended. Sending
+beams back requires a command authority, because clusters accept no other commands.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -35,7 +35,7 @@ Left = Callable[[int, Iterable[str]], frozenset[str]]
 
 @dataclass(frozen=True)
 class _Moved:
-    """A beam away from its aim: the aim, the token that keeps the beam away, and until when.
+    """A beam away from its aim: the aim, the token that keeps the beam away, and the end time.
 
     ``small``: the beam is on the same receiver as its aim; ``pause``: before the next attempt, s.
     """
@@ -66,11 +66,11 @@ class Movements:
 
     @property
     def names(self) -> frozenset[str]:
-        """The heliostats whose beams are moved, or on the way back."""
+        """The heliostats whose beams are away from their aims, or on the way back."""
         return frozenset(self._moved)
 
     def aim(self, heliostat: str, present: FloatArray) -> FloatArray:
-        """Return the aim of a heliostat without movement, (3,); ``present`` if it is not moved."""
+        """Return the aim to which a moved beam returns, (3,); ``present`` if it is not moved."""
         known = self._moved.get(heliostat)
         return present if known is None else known.aim
 
@@ -96,7 +96,7 @@ class Movements:
         Raises
         ------
         BeamError
-            If a heliostat may not.
+            If a heliostat may not be moved.
         """
         base = np.stack([self.aim(name, aim) for name, aim in zip(names, aims, strict=True)])
         on = np.zeros(len(names), dtype=np.bool_)
@@ -119,15 +119,20 @@ class Movements:
             raise BeamError("AIM", blocked)
 
     def take(self, names: Sequence[str], aims: FloatArray, token: int, now: float) -> None:
-        """Record that beams are moved; ``aims`` (K, 3) count for heliostats not moved before."""
+        """Record that beams are moved.
+
+        A beam that was not moved before will return to its entry in ``aims``, (K, 3).
+        """
         for name, present in zip(names, aims, strict=True):
             aim = np.array(self.aim(name, present))
             self._moved[name] = _Moved(aim, token, now + LIFE, small=True)
 
     def lend(self, names: Sequence[str], aims: FloatArray, wanted: FloatArray, token: int) -> None:
-        """Note the aims that a visit assigns, and the present aims for the beams' return, (K, 3).
+        """Note the aims that a visit assigns, and the present aims, (K, 3).
 
-        A heliostat that is assigned its own aim, or that had none, does not return later.
+        The beams return to the present aims.
+
+        A heliostat that is assigned its own aim, or that had no aim, does not return later.
         """
         for name, aim in self.record(names, aims, wanted)["LENT"].items():
             if aim is not None:
@@ -150,17 +155,17 @@ class Movements:
         return {"LENT": found}
 
     def small(self, names: Sequence[str]) -> frozenset[str]:
-        """Return the heliostats that were moved only slightly, and so need no turn to return."""
+        """Return the heliostats that were moved only slightly, and so can return without a turn."""
         return frozenset(name for name in names if self._moved[name].small)
 
     def forget(self, heliostats: Iterable[str]) -> None:
-        """Forget beams that have been assigned another aim."""
+        """Forget moved beams, because they have been assigned another aim."""
         for name in heliostats:
             self._moved.pop(name, None)
 
     @contextmanager
     def ending(self, heliostats: Collection[str]) -> Iterator[None]:
-        """Send the beams of heliostats back at the end of a block, however it ends."""
+        """Send the beams of heliostats back at the end of a block, however the block ends."""
         try:
             yield
         finally:
@@ -175,8 +180,8 @@ class Movements:
     def due(self, now: float, token: int, left: Left) -> dict[str, FloatArray]:
         """Return the aims of beams that must go back now, by heliostat.
 
-        Without a command authority (``token`` 0) there are none. ``left`` returns the heliostats
-        that no visit holds any longer under the token that moved them.
+        Without a command authority (``token`` 0), no beam goes back. ``left`` returns the
+        heliostats that no visit holds any longer under the token that moved them.
         """
         for ticket in [ticket for ticket in self._sent if ticket.finished]:
             self._sent.remove(ticket)

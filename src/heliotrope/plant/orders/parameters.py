@@ -1,4 +1,4 @@
-"""Parameters of local controllers: compared with the desired ones on connection, then sent."""
+"""Parameters of local controllers: on connection, they are compared and, if needed, written."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -49,8 +49,9 @@ def change_of_beam(before: Tables, after: Tables, aims: npt.ArrayLike) -> float:
     """Return the largest angle by which new parameters rotate a beam off its aim, rad.
 
     The present parameters are assumed to describe the heliostat, while its local controller aims
-    with the new parameters, for sun directions all around. The angle is infinite if no pose can be
-    reached with the new parameters, or if an aim can be reached only with the present ones.
+    with the new parameters. The angle is the largest over sun directions all around; it is infinite
+    if no pose can be reached with the new parameters, or if an aim can be reached only with the
+    present parameters.
 
     Parameters
     ----------
@@ -81,7 +82,7 @@ def change_of_beam(before: Tables, after: Tables, aims: npt.ArrayLike) -> float:
 
 
 def stored_items(answer: Answer) -> dict[str, bytes]:
-    """Return the items in a reply to ``stored``; none if the cluster could not read them.
+    """Return the items in a reply to ``stored``; no items if the cluster could not read them.
 
     Raises
     ------
@@ -107,7 +108,7 @@ def stored_items(answer: Answer) -> dict[str, bytes]:
 
 
 class ParameterSync(Part):
-    """Compares the stored parameters with the desired parameters, and writes those that differ.
+    """Compares the stored with the desired parameters, and writes parameters that differ.
 
     Parameters
     ----------
@@ -118,7 +119,7 @@ class ParameterSync(Part):
     proofs
         Checks that a beam is clear where parameters are written, and at stow.
     blocked
-        Function that returns why nothing may be written to a heliostat, None if it may.
+        Function that returns why nothing may be written to a heliostat; None if writing is allowed.
     token
         Function that returns the token under which differences are written, 0 if none may be
         written now.
@@ -163,14 +164,14 @@ class ParameterSync(Part):
     def on_stage(
         self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
     ) -> None:
-        """Compare heliostats that lacked parameters once they have a point."""
+        """Compare heliostats that lacked parameters, once they have an assigned point."""
         del now
         if stage is Stage.DONE and ticket.name in KINDS:
             for name in self._wanted.missing.keys() & heliostats:
                 self.compare(name)
 
     def greet(self, heliostats: Sequence[str]) -> None:
-        """Compare heliostats before they may move, because any boards may respond there.
+        """Compare heliostats before they may move, because their boards may have been replaced.
 
         Their cluster has connected, or their boards have restarted.
         """
@@ -179,7 +180,7 @@ class ParameterSync(Part):
         self._strange.update(name for name in heliostats if name in self._wanted.items)
 
     def differing(self, heliostat: str) -> str | None:
-        """Return how the parameters of a heliostat differ or may differ, None if they agree.
+        """Return how the parameters of a heliostat differ or may differ; None if they agree.
 
         They may differ if the heliostat has not been compared since its cluster connected or its
         board started.
@@ -227,7 +228,7 @@ class ParameterSync(Part):
         token: int,
         before: Callable[[], None] = lambda: None,
     ) -> None:
-        """Send items of an accepted ticket once it is recorded; call ``before`` just before that.
+        """Send items of an accepted ticket once it is recorded; call ``before`` just before.
 
         The heliostat is compared when the ticket has ended.
         """

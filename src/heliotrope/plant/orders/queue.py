@@ -46,7 +46,8 @@ _LAST = 10.0
 class _Under:
     """One message in transit.
 
-    It was issued with the token ``given`` and sent with ``token``; ``again`` sends it again.
+    The message was issued with the token ``given`` and sent with the token ``token``; ``again``
+    sends it again.
     """
 
     ticket: Ticket
@@ -60,7 +61,7 @@ class _Under:
 
 @dataclass
 class _Recording:
-    """Records that must be on disk before heliostats of a ticket are sent their command."""
+    """Records that must be on disk before the heliostats of a ticket are sent their command."""
 
     ticket: Ticket
     heliostats: tuple[str, ...]
@@ -84,7 +85,7 @@ class _Recording:
 
 
 class PlantOrders(Part):
-    """Accepted commands: their records, their messages and their tickets.
+    """Handles accepted commands: their records, their messages and their tickets.
 
     This part never waits for a disk. A command waits in the plant until its record is on disk
     (`when_recorded`); DEFOCUS and STOW do not wait, and overtake waiting commands.
@@ -116,7 +117,7 @@ class PlantOrders(Part):
     confirmed_at
         Last time that the audit log confirmed that it can write, monotonic s.
     problem
-        Why the audit log cannot write, empty if it can.
+        Why the audit log cannot write; "" if it can.
     latest
         Ticket of the last command; None before the first.
     last
@@ -163,7 +164,7 @@ class PlantOrders(Part):
 
     @property
     def owing(self) -> bool:
-        """Whether records wait to be written and the audit accepted the last one."""
+        """Whether records wait to be written, and the audit accepted the last record."""
         return bool(self._owed) and not self.problem
 
     def accept(
@@ -256,7 +257,7 @@ class PlantOrders(Part):
         recording.waited = True
 
     def _recorded(self, key: str, recording: _Recording, error: Exception | None) -> None:
-        """Send a command whose record is on disk, or end it because that failed."""
+        """Send a command whose record is on disk; end the command if recording failed."""
         ticket, heliostats = recording.ticket, recording.heliostats
         self._give_up_late(recording, self.clock.monotonic())
         del self._recording[key]
@@ -298,7 +299,7 @@ class PlantOrders(Part):
             recording.ticket.advance(recording.heliostats, Stage.REFUSED, text)
 
     def when_recorded(self, ticket: Ticket, send: Callable[[bool], None]) -> None:
-        """Call ``send`` once the ticket's record is on disk; never, if that takes too long.
+        """Call ``send`` once the ticket's record is on disk; do not call it if that takes too long.
 
         The argument of ``send`` is whether the command had to wait. If so, all checks made when it
         was accepted must be repeated, and heliostats that have ended in the meantime
@@ -338,11 +339,11 @@ class PlantOrders(Part):
         self._owe_result(ticket.identity, "done")
 
     def owe(self, work: Work) -> None:
-        """Hand work to the disk, to be done after the overdue records; it may be repeated."""
+        """Hand work to the disk, to be done after the overdue records. The work may be repeated."""
         self._owed.append(work)
 
     def pay(self) -> None:
-        """Hand the oldest overdue records to the disk, unless others are still being written."""
+        """Hand the oldest overdue records to the disk, unless a batch is still being written."""
         if self._paying:
             return
         batch, done = tuple(islice(self._owed, _BATCH)), [0]
@@ -402,7 +403,8 @@ class PlantOrders(Part):
         lifetime
             Replaces the default lifetime, s.
         again
-            Function that sends it to some heliostats again; None: at once, as before.
+            Function that sends the command to some heliostats again; None: it is sent again at
+            once, unchanged.
         """
         heliostats = tuple(heliostats)
 
@@ -466,7 +468,7 @@ class PlantOrders(Part):
         self._stow(self._stowing.due(now))
 
     def to_stow(self, heliostat: str) -> bool:
-        """Whether a heliostat waits for its turn to go to stow, and so must not be moved."""
+        """Whether a heliostat waits for its turn to go to stow, and must not move elsewhere."""
         return heliostat in self._stowing
 
     def _stow(self, parts: Mapping[Ticket, Sequence[str]]) -> None:
@@ -480,7 +482,10 @@ class PlantOrders(Part):
             self.emergency(ticket, act, left, again=True)
 
     def _supersede(self, ticket: Ticket, heliostats: frozenset[str]) -> None:
-        """End older repeated orders to the same heliostats, but no STOW because of a DEFOCUS."""
+        """End older repeated orders to the same heliostats.
+
+        A DEFOCUS does not end a STOW.
+        """
         for identity in self._sent_at:
             other = self._open.get(identity)
             if other is not None and other is not ticket and Act[other.name] <= Act[ticket.name]:
@@ -526,7 +531,7 @@ class PlantOrders(Part):
         self._under[identity].given, self._under[identity].again = token, again
 
     def _own(self, identity: str, token: int) -> int:
-        """Return the token with which a message is sent now; 0: it may no longer be sent."""
+        """Return the token with which a message is sent now; 0 if it may no longer be sent."""
         own = self.authority.present(token)
         if own and identity in self._under:
             self._under[identity].token, self._under[identity].ticket.sent = own, True
@@ -546,7 +551,7 @@ class PlantOrders(Part):
     # Reports of clusters.
 
     def take(self, cluster: str, progress: Progress) -> tuple[Ticket, tuple[str, ...]] | None:
-        """Handle a cluster's report; return its ticket and heliostats, None if unknown."""
+        """Handle a cluster's report; return its ticket and heliostats; None if it is unknown."""
         under = self._under.get(progress.identity)
         if under is None or under.cluster != cluster:
             return None
@@ -563,11 +568,11 @@ class PlantOrders(Part):
         return under.ticket, part
 
     def _crossed(self, under: _Under, stage: Stage) -> bool:
-        """Whether a message and a change of the command authority may have crossed.
+        """Whether a message and a change of the command authority may have crossed in transit.
 
-        Its cluster may then have refused its token although nothing else is wrong with it. A
-        command that failed may have been carried out, so an operator's command is sent again only
-        if it was refused. A command of an earlier authority holder is never sent again.
+        The cluster may then have refused the message's token although the message is valid
+        otherwise. A command that failed may have been carried out, so an operator's command is sent
+        again only if it was refused. A command of an earlier authority holder is never sent again.
         """
         mandated = self.authority.mandate_of(under.given) is not None
         if stage is not Stage.REFUSED and not (mandated and stage is Stage.FAILED):
@@ -633,7 +638,10 @@ class PlantOrders(Part):
         await self._until(self._settled, until)
 
     def _settled(self) -> bool:
-        """Return whether the overdue records are written or cannot be; start the next batch."""
+        """Return whether no overdue record can be written now; start the next batch.
+
+        That is so if all are written, or if the last attempt failed.
+        """
         if self.owing:
             self.pay()
         return not (self._paying or self.owing)
@@ -656,7 +664,7 @@ def whole(values: Sequence[float], codes: str, command: str) -> tuple[float, ...
     Raises
     ------
     InputError
-        If there are too many or too few numbers, or one is out of range.
+        If there are too many or too few numbers, or a number is out of range.
     """
     if len(values) != len(codes):
         raise InputError(

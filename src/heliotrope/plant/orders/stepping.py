@@ -1,10 +1,10 @@
 """Fine steps for a measurement, and coarse steps again afterwards.
 
 Motors whose drivers switch off at rest stop only at full steps (ROUGH), which are too coarse for
-measurements, so they use microsteps for the duration of a visit. So that they return to coarse
-steps whatever happens to the visit, the plant itself orders both: fine steps while a visit needs
-them, coarse steps as soon as no visit does and motions are accepted. That requires a command
-authority, because clusters accept no other commands.
+measurements, so they use microsteps for the duration of a visit. To make sure that they return to
+coarse steps whatever happens to the visit, the plant itself orders fine steps while a visit needs
+them, and coarse steps as soon as no visit needs fine steps and motions are accepted. That requires
+a command authority, because clusters accept no other commands.
 """
 
 from collections import Counter
@@ -66,7 +66,7 @@ class Stepping:
             self._needed.subtract(names)
 
     def ordered(self, heliostats: Iterable[str], rough: bool) -> None:
-        """Record the step mode that an operator orders for the time without visits."""
+        """Record the step mode that an operator orders for times without a visit."""
         if rough:
             self._rough.update(heliostats)
             self._open.update(heliostats)
@@ -75,7 +75,7 @@ class Stepping:
 
     @property
     def lent(self) -> frozenset[str]:
-        """Heliostats that return to coarse steps after a visit without a plant-file entry."""
+        """Heliostats, not listed in the plant file, that return to coarse steps after a visit."""
         return frozenset(self._open & self._rough - self._rests)
 
     def record(self, heliostats: Iterable[str]) -> Held:
@@ -89,9 +89,9 @@ class Stepping:
         return tuple(name for name in heliostats if unsure[self._field.index[name]])
 
     def due(self, now: float, token: int) -> dict[bool, tuple[str, ...]]:
-        """Return the heliostats to be ordered to use coarse steps (True) or fine steps (False).
+        """Return the heliostats to be ordered to coarse steps (key True) or fine steps (key False).
 
-        There are none without a command authority (``token`` 0).
+        Nothing is ordered without a command authority (``token`` 0).
         """
         found: dict[bool, list[str]] = {True: [], False: []}
         known, steps = self._reported(now)

@@ -1,4 +1,4 @@
-"""The queue for an ordinary STOW of many heliostats, which start one after the other.
+"""The queue for an ordinary STOW of many heliostats, so that they start one after the other.
 
 Like STOW ALL of Malan's controller (thesis, table D.1, 0xD9), it protects the power supply from the
 current of all drives starting together. Emergencies, the safety table and expired leases never wait
@@ -19,7 +19,8 @@ class StowQueue:
     Parameters
     ----------
     rate
-        Heliostats that start per second, and at once after a pause; 0: no heliostat waits.
+        Number of heliostats that start per second, and also at once after a pause; 0: no heliostat
+        waits.
     """
 
     def __init__(self, rate: float) -> None:
@@ -40,7 +41,7 @@ class StowQueue:
     def put(self, ticket: Ticket, heliostats: Iterable[str]) -> dict[Ticket, list[str]]:
         """Add heliostats; return the heliostats of earlier orders that this order replaces.
 
-        A heliostat that is already waiting keeps its place, so repeating an order delays no
+        A heliostat that is already waiting keeps its place, so a repeated order delays no
         heliostat.
         """
         replaced: dict[Ticket, list[str]] = {}
@@ -52,7 +53,7 @@ class StowQueue:
         return replaced
 
     def due(self, now: float) -> dict[Ticket, list[str]]:
-        """Remove the heliostats whose turn it is at a time, monotonic s, and return them."""
+        """Remove and return the heliostats whose turn has come at a time, monotonic s."""
         if not self._waiting:
             return {}
         self._spare = min(self.rate, self._spare + self.rate * (now - self._at))
@@ -62,7 +63,7 @@ class StowQueue:
         return self.take(some)
 
     def take(self, heliostats: Iterable[str]) -> dict[Ticket, list[str]]:
-        """Remove some heliostats, whether or not it is their turn, and return them."""
+        """Remove and return some heliostats, whether or not their turn has come."""
         found: dict[Ticket, list[str]] = {}
         for name in heliostats if self._waiting else ():
             ticket = self._waiting.pop(name, None)

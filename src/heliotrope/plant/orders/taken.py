@@ -16,7 +16,7 @@ class Taken(Part):
     Parameters
     ----------
     movements, locks, stepping
-        The three kinds; the owner recalls what their records name.
+        The three kinds of things taken; the owner of this object restores them from the records.
     points
         The records, stored with the assigned points (`assigned.HELD`).
     owe

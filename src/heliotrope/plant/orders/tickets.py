@@ -41,7 +41,7 @@ class Ticket:
         What each heliostat of an operation is doing or waiting for now, or its result; empty for a
         command.
     accepted_at
-        Monotonic s.
+        When the command was accepted, monotonic s.
     recorded
         Whether its record was on disk before it was sent; False for DEFOCUS and STOW.
     sent
@@ -65,7 +65,7 @@ class Ticket:
         self._news = asyncio.Event()
 
     def record(self) -> None:
-        """Note that its record is on disk."""
+        """Note that the record of the command is on disk."""
         self.recorded = True
         self._news.set()
 
@@ -73,7 +73,10 @@ class Ticket:
         return f"<Ticket {self.identity} {self.text}>"
 
     def advance(self, heliostats: Iterable[str], stage: Stage, text: str = "") -> None:
-        """Note a stage that heliostats have reached; stages never go back; final stages stay."""
+        """Note a stage that heliostats have reached.
+
+        A stage never goes back, and a final stage never changes.
+        """
         rank = RANK[stage]
         rows = [self._row[name] for name in heliostats if name in self._row]
         if not rows:
@@ -90,7 +93,10 @@ class Ticket:
             self._news.set()
 
     def step(self, texts: Mapping[str, str], stage: Stage | None) -> None:
-        """Note what heliostats do or wait for, by name, and their stage; None: stage unchanged."""
+        """Note what heliostats do or wait for, by name, and their stage.
+
+        If the stage is None, it stays unchanged.
+        """
         self.steps.update(texts)
         if stage is None:
             return
@@ -152,7 +158,7 @@ class Ticket:
 
     @property
     def text(self) -> str:
-        """One line: the number at each stage, and the most frequent reasons."""
+        """In one line: the number of heliostats at each stage, and the most frequent reasons."""
         parts = ", ".join(f"{n} {word}" for word, n in self.counted().items())
         left = self.waiting(self.steps)
         # Results of completed heliostats are listed only if there is nothing else to report.
@@ -160,14 +166,16 @@ class Ticket:
         return f"{self.name}: {parts}" + (f" ({why})" if why else "")
 
     async def reached(self, stage: Stage, timeout: float = math.inf) -> bool:
-        """Wait until every heliostat is at a stage or has ended; False if one did not get there.
+        """Wait until every heliostat is at a stage or has ended.
+
+        Return False if a heliostat ended without reaching the stage.
 
         Parameters
         ----------
         stage
             ACCEPTED to DONE.
         timeout
-            s, by the plant's clock; returns False when it expires.
+            Longest wait, s, by the plant's clock; when it expires, False is returned.
         """
         until = self._clock.monotonic() + timeout
         while not (self._stage >= RANK[stage]).all():
@@ -179,9 +187,11 @@ class Ticket:
         return bool((self._stage <= FINAL).all())
 
     async def written(self, timeout: float) -> bool:
-        """Wait until its record is on disk, or it has ended without a record; return which.
+        """Wait until the record is on disk, or the ticket has ended without a record.
 
-        ``timeout`` is in s, by the plant's clock; returns False when it expires.
+        Return whether the record is on disk.
+
+        ``timeout`` is in s, by the plant's clock; when it expires, False is returned.
         """
         until = self._clock.monotonic() + timeout
         while not (self.recorded or self.finished):
@@ -191,12 +201,12 @@ class Ticket:
         return self.recorded
 
     async def end(self, timeout: float = math.inf) -> bool:
-        """Wait until every heliostat has ended; True if all are done."""
+        """Wait until every heliostat has ended; return whether all are done."""
         return await self.reached(Stage.DONE, timeout)
 
 
 async def _within(clock: Clock, until: float, event: asyncio.Event) -> bool:
-    """Wait for an event until a given time; False if the time came first."""
+    """Wait for an event until a given time; return False if the time came first."""
     if clock.monotonic() >= until:
         return False
     try:

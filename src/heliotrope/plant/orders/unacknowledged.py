@@ -1,7 +1,7 @@
 """Points that were sent to local controllers, and whether they were accepted.
 
-The plant checks and records a point before it is sent, and relies on it once it is sent. A local
-controller that is busy refuses it, and continues with the previous point.
+The plant checks and records a point before it is sent, and relies on it once it is sent. A busy
+local controller refuses the point, and continues with the previous point.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ _NOT_TAKEN = {"AIM": AIM_NOT_TAKEN, "STANDBY": STANDBY_NOT_TAKEN}
 
 
 class Unacknowledged(Part):
-    """The last ticket of each heliostat's points that may not have been accepted.
+    """For each heliostat, the last ticket for a point that may not have been accepted.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class Unacknowledged(Part):
     def on_stage(
         self, ticket: Ticket, heliostats: tuple[str, ...], stage: Stage, now: float
     ) -> None:
-        """Note accepted points, unless others have been sent since."""
+        """Note accepted points, unless newer points have been sent since."""
         del now
         if stage is not Stage.DONE or ticket.name not in KINDS:
             return
@@ -70,7 +70,7 @@ class Unacknowledged(Part):
             self._points.taken(ticket.name, rows)
 
     def untaken(self, kind: str, heliostat: str) -> str | None:
-        """Return the reason why a heliostat has another point than the assigned one, or None."""
+        """Return why a heliostat has not taken its assigned point; None if it may have."""
         last = self._tickets[kind]
         if heliostat not in last:
             return None
@@ -82,7 +82,7 @@ class Unacknowledged(Part):
         return None
 
     def unknown(self, kind: str, heliostat: str) -> str | None:
-        """Return the reason why a heliostat may have any point, or None; see `Points`."""
+        """Return why the point of a heliostat is unknown; None if it is known. See `Points`."""
         reason = self.untaken(kind, heliostat)
         row = self._field.place(heliostat)
         return reason if reason and self._points.unknown(kind, slice(row, row + 1)).all() else None

@@ -1,7 +1,8 @@
-"""The best visit at a given moment: all heliostats screened by bounds, the best judged exactly.
+"""Finds the best visit at a given moment: screens all heliostats, judges the best exactly.
 
-Screening considers only angles, as if each mirror rotated about its foot. The candidates are then
-judged in the order of their bounds, including shading and blocking by neighbours.
+Screening uses bounds. It considers only angles, as if each mirror rotated about its foot. The
+candidates are then judged in the order of their bounds, including shading and blocking by
+neighbours.
 """
 
 from collections.abc import Sequence
@@ -100,7 +101,7 @@ class Sight:
         self._eyes = [c.position for c in cameras if c.position is not None]
 
     def able(self, sun: FloatArray, limits: SightingLimits) -> Mask:
-        """Return a mask of the heliostats that may be within the limits, with some slack, (N,)."""
+        """Return a mask of the heliostats that may be within slightly relaxed limits, (N,)."""
         half_way = 0.5 * angle_between(np.broadcast_to(sun, self.path.shape), self.path)
         return np.asarray(
             (half_way <= limits.max_incidence + SLACK)
@@ -108,7 +109,9 @@ class Sight:
         )
 
     def seen(self, square: FloatArray, rows: npt.NDArray[np.intp] | slice) -> FloatArray:
-        """Return the chance that a beam is completely on the target in the first photograph, (K,).
+        """Return the probability that each beam is completely on the target at first, (K,).
+
+        "At first" means in the first photograph of the visit.
 
         Parameters
         ----------
@@ -120,7 +123,7 @@ class Sight:
         return chance_on_target(self.target, self._position[rows], self._size[rows], square)
 
     def glare(self, sun: FloatArray) -> float:
-        """Return the smallest angle between the sun and a camera's line of sight, rad."""
+        """Return the smallest angle between the sun and any camera's line of sight, rad."""
         lines = [self.target.center - eye for eye in self._eyes]
         return min(
             (float(angle_between(line / np.linalg.norm(line), sun)) for line in lines),
@@ -131,7 +134,7 @@ class Sight:
 def hidden(
     offsets: FloatArray, normal: FloatArray, size: FloatArray, path: FloatArray
 ) -> FloatArray:
-    """Return the fraction of mirrors that neighbours hide in a direction, (K,).
+    """Return the fraction of each mirror that neighbours hide in a direction, (K,).
 
     Parameters
     ----------
@@ -163,7 +166,7 @@ def hidden(
 
 @dataclass(frozen=True)
 class Choice:
-    """The best visit found: its value, the heliostat's row, its slope (2, P), the assignment."""
+    """The best visit found: value, heliostat index, slope (2, P), and assignment."""
 
     value: float
     row: int
@@ -173,7 +176,11 @@ class Choice:
 
 @dataclass(frozen=True)
 class Moment:
-    """The inputs of a decision: POSIX s, sun (3,), squares and ages (N,), counts (N, 2)."""
+    """The inputs of a decision at one moment.
+
+    They are the time, POSIX s; the sun vector, (3,); the squared errors and the ages, (N,); and the
+    step counts, (N, 2).
+    """
 
     now: float
     sun: FloatArray
@@ -220,7 +227,7 @@ class Judge:
         self._again = {name: np.full(len(known), -np.inf) for name in self.sights}
 
     def of(self, known: FieldKnowledge) -> "Judge":
-        """Return a copy that judges from other knowledge."""
+        """Return a copy that bases its decisions on other knowledge."""
         other = copy(self)
         other._known = known  # noqa: SLF001 - its own kind
         again = {name: until.copy() for name, until in self._again.items()}
@@ -277,10 +284,10 @@ class Judge:
     def _best(
         self, moment: Moment, chosen: Mask, targets: Sequence[str], overdue: bool
     ) -> Choice | None:
-        """Return the best of the chosen heliostats on any of the targets.
+        """Return the best visit of a chosen heliostat to any of the targets.
 
-        Overdue heliostats are ranked by age, the others by the reduction of their expected squared
-        error for each second of the visit.
+        Overdue heliostats are ranked by age, all others by the reduction of their expected squared
+        error per second of the visit.
         """
         row, place, bound = self._screen(moment, chosen, targets, overdue)
         order = np.argsort(-bound, kind="stable")
@@ -301,7 +308,7 @@ class Judge:
     def _screen(
         self, moment: Moment, chosen: Mask, targets: Sequence[str], overdue: bool
     ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], FloatArray]:
-        """Return candidates: their rows, their targets, and an upper bound of their value."""
+        """Return the candidates: heliostat indices, targets, and upper bounds of their values."""
         rows, places, bounds = [], [], []
         for t, name in enumerate(targets):
             sight = self.sights[name]
@@ -316,7 +323,7 @@ class Judge:
         return np.concatenate(rows), np.concatenate(places), np.concatenate(bounds)
 
     def _worth(self, gain: FloatArray, drive: npt.ArrayLike, seen: FloatArray) -> FloatArray:
-        """Return the gain per second, rad²/s."""
+        """Return the gain of a visit per second, rad²/s."""
         return np.asarray(gain * self._chance(seen) / self._time(drive, seen))
 
     def _chance(self, seen: FloatArray) -> FloatArray:
@@ -334,7 +341,7 @@ class Judge:
     def _judge(
         self, moment: Moment, rows: npt.NDArray[np.intp], target: str, overdue: bool
     ) -> Choice | None:
-        """Return the best of some heliostats on one target."""
+        """Return the best visit of some heliostats to one target."""
         sight, settings = self.sights[target], self._settings
         best: Choice | None = None
         field = self._known

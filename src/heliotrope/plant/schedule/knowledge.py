@@ -1,10 +1,10 @@
 """Knowledge about the heliostats of a plant, and its decay with time.
 
-The covariance of a heliostat's parameters is that of its calibration, or of the priors before the
-first calibration. The zeros of the drives drift, so the covariance grows with the time since the
+A heliostat's parameters have the covariance of its calibration or, before the first calibration, of
+the priors. The zeros of the drives drift, so the covariance grows with the time since the
 calibration. The effect of parameter errors on the beam over the year is a quadratic form that
-varies slowly over the field: it is computed for a sample of heliostats, and all others use that of
-the nearest sample.
+varies slowly over the field: it is computed for a sample of heliostats, and every other heliostat
+uses the form of the nearest sample.
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,7 +52,7 @@ class VisitYield:
     normal
         Mirror normals, (K, 3).
     drive
-        Time to get there, s, (K,); 0 if speeds or counts are unknown.
+        Travel time to the target, s, (K,); 0 if speeds or counts are unknown.
     slope
         Whitened derivative of all photographs of the visit together, (K, 2, P).
     gain
@@ -83,7 +83,7 @@ class Knowledge:
     model
         Parameters: a name of the table, or names.
     priors
-        Standard deviations that replace those of the table, by name.
+        Standard deviations that replace the values in the table, by name.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class Knowledge:
         return np.asarray(np.minimum(self._known + added, self.first))
 
     def faded(self, rows: Rows, now: float) -> FloatArray:
-        """Return the covariance of heliostats at a time, (K, P, P), never above the prior."""
+        """Return the covariances of heliostats at a time, (K, P, P), never above the prior."""
         added = self._added(rows, now)
         grown = self.covariance[rows] + added[:, :, None] * np.eye(len(self.names))
         more = np.einsum("np,np->n", self._weight[self._like[rows]], added)
@@ -161,7 +161,7 @@ class Knowledge:
         return found
 
     def grow_as(self, row: int, growth: Growth) -> None:
-        """Set a heliostat's drift from its record; its group shares one object."""
+        """Set a heliostat's drift from its record; a group shares one drift object."""
         if growth not in self._growths:
             used = np.unique(np.delete(self._grows, row))
             self._growths = (*(self._growths[k] for k in used), growth)
@@ -189,7 +189,7 @@ class Knowledge:
         now, sun
             POSIX s and unit vector ENU, (3,).
         target, limits
-            The target, and the allowed suns and angles.
+            The target, and the limits on sun positions and angles.
         shots, sigma
             Photographs of a visit, and the standard deviation of the beam in each, rad.
         counts
@@ -215,13 +215,13 @@ class Knowledge:
         return VisitYield(able, aimed.normal, drive, slope, gain, sigma**2 * (seen + 2.0))
 
     def fleet(self, labels: Sequence[str], now: float, sigma: float) -> Fleet:
-        """Return all heliostats at a time for a plan, with covariances instead of information."""
+        """Return all heliostats at a time, for a plan, with covariances instead of information."""
         form = self._form[self._like]
         known = self.faded(np.arange(len(self.since)), now)
         return Fleet(self.mechanism, self.names, known, form, self._aim, sigma, tuple(labels))
 
     def assume(self, row: int, slope: FloatArray, now: float) -> None:
-        """Assume that a visit with this slope (2, P) has been made."""
+        """Assume that a visit with the derivative ``slope`` (2, P) has been made."""
         rows = np.array([row], dtype=np.intp)
         self.covariance[row] = _gain.updated(self.faded(rows, now)[0], slope)
         self._set(rows, now)
@@ -239,7 +239,7 @@ class Knowledge:
         self._set(np.array([row], dtype=np.intp), record.at)
 
     def doubt(self, row: int, factor: float) -> None:
-        """Multiply the variances by a factor, because the beam was found elsewhere."""
+        """Multiply the variances by a factor, because the beam was far from its prediction."""
         self.covariance[row] *= factor
         self._set(np.array([row], dtype=np.intp), float(self.since[row]))
 
@@ -252,7 +252,7 @@ class Knowledge:
 
 
 class FieldKnowledge:
-    """Knowledge of all N heliostats of a plant, group by group, in one order of rows.
+    """Knowledge of all N heliostats of a plant, group by group, in one order of indices.
 
     Parameters
     ----------
@@ -263,7 +263,8 @@ class FieldKnowledge:
     names
         Order of the rows.
     begin, year
-        Time from which the age of an uncalibrated heliostat counts, POSIX s; year of the suns.
+        Time from which the age of an uncalibrated heliostat counts, POSIX s; year of the sun
+        positions.
 
     Attributes
     ----------
@@ -277,7 +278,7 @@ class FieldKnowledge:
     Raises
     ------
     InputError
-        If the names are not those of the design.
+        If the names differ from the names in the design.
     """
 
     def __init__(
@@ -323,14 +324,14 @@ class FieldKnowledge:
         return other
 
     def squares(self, now: float) -> FloatArray:
-        """Return the expected squared beam errors over the year at a time, rad², (N,)."""
+        """Return the squared beam errors over the year, as expected at a given time, rad², (N,)."""
         found = np.empty(len(self))
         for known, rows in zip(self._groups, self._rows, strict=True):
             found[rows] = known.expected(now)
         return found
 
     def ages(self, now: float) -> FloatArray:
-        """Return the times since the last calibration, or since the beginning, s, (N,)."""
+        """Return the time since each heliostat's last calibration, or since ``begin``, s, (N,)."""
         since = np.empty(len(self))
         for known, rows in zip(self._groups, self._rows, strict=True):
             since[rows] = known.since
@@ -344,7 +345,7 @@ class FieldKnowledge:
         target: Target,
         counts: FloatArray | None,
     ) -> VisitYield:
-        """Return the expected yield of visits of heliostats of one group; see `Knowledge.look`."""
+        """Return the expected yield of visits by heliostats of one group; see `Knowledge.look`."""
         settings, known = self._settings, self._groups[int(self.group[rows[0]])]
         return known.look(
             self._place[rows],
@@ -358,7 +359,7 @@ class FieldKnowledge:
         )
 
     def fleets(self, now: float) -> tuple[tuple[Fleet, ...], Rows]:
-        """Return the heliostats for a plan, see `Knowledge.fleet`, and their rows in its order."""
+        """Return the heliostats for a plan, and their indices; see `Knowledge.fleet`."""
         names = np.array(list(self.row))
         sigma = self._settings.sigma
         found = tuple(
@@ -368,7 +369,7 @@ class FieldKnowledge:
         return found, np.concatenate(self._rows)
 
     def assume(self, row: int, slope: FloatArray, now: float) -> None:
-        """Assume that a visit with this slope (2, P) has been made."""
+        """Assume that a visit with the derivative ``slope`` (2, P) has been made."""
         self._groups[self.group[row]].assume(int(self._place[row]), slope, now)
 
     def learn(self, row: int, record: HeliostatCalibration) -> None:

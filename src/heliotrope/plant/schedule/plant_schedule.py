@@ -1,6 +1,7 @@
-"""The schedule of a running plant: time, sun vector and states from the controller, results back.
+"""The schedule of a running plant, which reads the controller and accepts the results of visits.
 
-It implements `Scheduling` for automatic control.
+It takes time, sun vector and states from the controller, and implements `Scheduling` for automatic
+control.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,14 +33,14 @@ _LATE = 60.0
 
 @dataclass(frozen=True)
 class _Ready:
-    """States of the field: IDLE where a heliostat may be measured, else unknown."""
+    """States of the field: IDLE for a heliostat that may be measured, otherwise unknown."""
 
     state: npt.NDArray[np.uint8]
     counts: npt.NDArray[np.int32]
 
 
 def settings_for(cycle: CycleSettings, settings: Settings | None = None) -> Settings:
-    """Return schedule settings whose visits match those of a calibration cycle."""
+    """Return schedule settings whose visits match the visits of a calibration cycle."""
     return replace(
         settings or Settings(),
         model=cycle.first_model,
@@ -50,7 +51,7 @@ def settings_for(cycle: CycleSettings, settings: Settings | None = None) -> Sett
 
 
 class PlantSchedule:
-    """Choice of heliostats by expected gain, in a running plant.
+    """Chooses heliostats by expected gain, in a running plant.
 
     Parameters
     ----------
@@ -81,9 +82,9 @@ class PlantSchedule:
     def next(
         self, target: str, ready: npt.NDArray[np.bool_], beside: bool = False
     ) -> PlannedVisit | None:
-        """Return the next of the ready heliostats (N,) for a free target, None if none is due.
+        """Return the next of the ready heliostats (N,) for a free target; None if none is due.
 
-        With ``beside``, the heliostat goes there together with those returned before.
+        With ``beside``, the heliostat joins the heliostats of the earlier calls on the target.
         """
         for gone in list(self.scheduler.running.values()):
             # The target is free, so the previous visit there has ended without a result.
@@ -111,11 +112,11 @@ class PlantSchedule:
 
     @property
     def reason(self) -> str:
-        """The reason for the last choice, or for making none; "" before the first."""
+        """Why the last visit was chosen, or why none was; "" before the first choice."""
         return self.scheduler.reason
 
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[PlannedVisit]:
-        """Return the planned visits; each call extends a new plan while the old one is shown."""
+        """Return the planned visits; each call extends a new plan while the old plan is shown."""
         now = self._plant.now()
         if self._coming is None and now - self._made >= REPLAN:
             self._draft = []
@@ -132,7 +133,7 @@ class PlantSchedule:
         return [p for p in shown if p.heliostat not in away and p.at >= since][:limit]
 
     def foresee(self, able: npt.NDArray[np.bool_], targets: Sequence[str]) -> FieldProspect | None:
-        """Return the present knowledge, from which to predict the day; None without targets."""
+        """Return the present knowledge, for predicting the day; None if there are no targets."""
         return self.scheduler.prospect(self._plant.clock.utc(), able, targets)
 
     def done(self, entry: CalibrationEntry) -> None:

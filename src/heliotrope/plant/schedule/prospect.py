@@ -1,7 +1,7 @@
 """Predicts the field errors for the rest of a day, from the schedule's knowledge.
 
-The prediction is a plan as from `calibration.plan.plan_commission`, with the schedule's own visit
-times, photograph accuracy, minimum gain and goal.
+The prediction is a plan like a plan from `calibration.plan.plan_commission`, but with the
+schedule's own visit times, photograph accuracy, minimum gain and goal.
 """
 
 from collections.abc import Sequence
@@ -50,7 +50,7 @@ class JointVisitTime:
     worst
         Largest expected beam error among them on the target, rad RMS (2-D).
     seconds
-        Its duration.
+        Duration of the visit.
     """
 
     mirrors: int
@@ -67,7 +67,7 @@ class ReceiverVisitTime:
     mirrors, lit
         Number of heliostats that took part, and number whose beams were on the receiver.
     seconds
-        Its duration.
+        Duration of the visit.
     """
 
     mirrors: int
@@ -83,7 +83,7 @@ def terms_of(
     receiver: ReceiverTerms | None = None,
     receiver_visits: Sequence[ReceiverVisitTime] = (),
 ) -> CommissionTerms:
-    """Return the terms of a plan whose visits are those of a schedule.
+    """Return the terms of a plan with the visits of a schedule.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def terms_of(
 def _joint_terms(
     settings: Settings, joint: JointSettings, made: Sequence[JointVisitTime]
 ) -> JointTerms:
-    """Return the terms of joint visits; with actual times once there are enough visits."""
+    """Return the terms of joint visits, with actual times once there have been enough visits."""
     terms = JointTerms.of(joint, settings.sigma)
     if len(made) < _KNOWN:
         return terms
@@ -131,7 +131,7 @@ def _joint_terms(
 
 
 def _receiver_terms(terms: ReceiverTerms, made: Sequence[ReceiverVisitTime]) -> ReceiverTerms:
-    """Return the terms of receiver visits; with actual times once there are enough visits."""
+    """Return the terms of receiver visits, with actual times once there have been enough visits."""
     if len(made) < _KNOWN:
         return terms
     expected = sum(terms.span(one.mirrors, one.lit) for one in made)
@@ -156,9 +156,11 @@ class FieldProspect:
         Heliostats with the *covariance* of their parameters in place of the information, which is
         computed beside the plant.
     size
-        Longer side of the mirrors, m, (N,); like the next two, in the order of the fleets.
+        Longer side of the mirrors, m, (N,); this and the next two arrays are in the order of the
+        fleets.
     measured, held
-        Masks of the heliostats that are calibrated, and that cannot be measured on this day, (N,).
+        Masks of the calibrated heliostats, and of the heliostats that cannot be measured on this
+        day, (N,).
     terms
         Terms of the visits.
     """
@@ -179,7 +181,7 @@ class FieldProspect:
         return FieldPoint(self.at, *(0.5 * found).tolist())
 
     def outlook(self) -> Outlook | None:
-        """Return the prediction, None if the sun is too low for the rest of the day."""
+        """Return the prediction; None if the sun is too low for the rest of the day."""
         try:
             plan = plan_commission(
                 self._informed(),
@@ -201,7 +203,7 @@ class FieldProspect:
         return Outlook(self.at, able, goal, plan.reached, points, _told(plan))
 
     def _interval(self) -> float:
-        """Return the time in which all heliostats are visited once, the interval of the plan."""
+        """Return the interval of the plan: the time in which all heliostats are visited once."""
         joint, count = self.terms.joint, len(self.held)
         each = self.terms.alone
         if joint is not None:
@@ -214,7 +216,7 @@ class FieldProspect:
 
 
 def _told(plan: CommissionPlan) -> str:
-    """Return the outcome in one sentence."""
+    """Describe the outcome in one sentence."""
     goal, high = 0.5e3 * plan.terms.goal, 0.5e3 * plan.percentiles[-1, 1]
     if plan.reached is not None:
         when = datetime.fromtimestamp(plan.reached, UTC)

@@ -1,10 +1,11 @@
 """The calibration schedule: which heliostat is photographed next, on which target.
 
 A decision has two steps. All heliostats are screened by angles and by an upper bound on the gain of
-a visit: the whole of their expected squared beam error, divided by the duration of a visit. In the
-order of this bound they are judged exactly, a chunk at a time, considering stops, the travel of the
-drives, shading, blocking, and by how much the error would fall. The decision is made when no bound
-exceeds the best value found. Heliostats that have waited too long for a calibration come first.
+a visit: the whole of their expected squared beam error, divided by the duration of a visit. The
+heliostats are then judged exactly in the order of this bound, a chunk at a time. This considers
+stops, the travel of the drives, shading, blocking, and by how much the error would fall. The
+decision is made when no bound exceeds the best value found. Heliostats that have waited too long
+for a calibration come first.
 
 This module reads no clock and moves no heliostat: time, sun vector and states are arguments.
 """
@@ -78,7 +79,7 @@ class Visited:
         Beam error in the photographs of this visit under the previous calibration, rad RMS (2-D);
         NaN if none could be used.
     text
-        The same for display.
+        The result in words, for display.
     together
         Whether it was on the target together with other heliostats.
     """
@@ -114,14 +115,14 @@ class Comparison:
     visits, calibrated
         Number of visits, and number of visits that produced a new calibration.
     measured, predicted
-        Beam error measured in the photographs, and expected there, rad RMS (2-D), over visits with
-        both; NaN if there are none.
+        Beam error measured in the photographs, and the beam error expected there, rad RMS (2-D),
+        over visits with both values; NaN if there are no such visits.
     longer
         Mean duration of a single visit, as a fraction of the expected duration; NaN without visits.
     surprises
-        Heliostats found more than `SURPRISE` times as far off as expected.
+        Heliostats whose error was more than `SURPRISE` times the expected error.
     alone
-        Number of single visits, and number of those that produced a new calibration.
+        Number of single visits, and number of single visits that produced a new calibration.
     joint_visits
         Joint visits.
     """
@@ -137,21 +138,21 @@ class Comparison:
 
     @property
     def ratio(self) -> float:
-        """Measured over predicted error, near 1 if the prediction is correct."""
+        """Measured error divided by predicted error; near 1 if the prediction is correct."""
         return self.measured / self.predicted
 
     @property
     def pace(self) -> float:
         """Mean time per single calibration, as a fraction of the expected visit duration.
 
-        NaN before there are `ENOUGH` visits.
+        The value is NaN until there are `ENOUGH` visits.
         """
         visits, calibrated = self.alone
         return self.longer * visits / max(calibrated, 1) if visits >= ENOUGH else float("nan")
 
     @property
     def text(self) -> str:
-        """One line."""
+        """The comparison in one line."""
         if not self.visits:
             return "no visits"
         head = f"{self.visits} visits, {self.calibrated} calibrated"
@@ -192,7 +193,7 @@ def compare(finished: Iterable[Finished]) -> Comparison:
 
 
 def _joint_visits(made: Iterable[Finished]) -> Iterator[JointVisitTime]:
-    """Yield the joint visits: those of one target that end at once."""
+    """Yield the joint visits: groups of visits to one target that end at the same time."""
     for _, group in groupby(made, key=lambda f: (f.visited.target, round(f.visited.ended))):
         visits = list(group)
         begin = min(f.planned.at for f in visits)
@@ -205,12 +206,12 @@ class States(Protocol):
 
     @property
     def state(self) -> npt.NDArray[np.uint8]:
-        """States from `lcu.states`, any other number if unknown, (N,)."""
+        """States from `lcu.states`, (N,); any other number if a state is unknown."""
         ...
 
     @property
     def counts(self) -> npt.NDArray[np.int32]:
-        """Counts of the drives, (N, 2)."""
+        """Step counts of the drives, (N, 2)."""
         ...
 
 
@@ -227,14 +228,14 @@ class Scheduler:
         Start time: the age of uncalibrated heliostats counts from here, and its year determines the
         sun positions.
     names
-        Order of the heliostats in `States`; by default that of the design.
+        Order of the heliostats in `States`; by default the order in the design.
 
     Attributes
     ----------
     names
         The heliostats.
     reason
-        Why the last decision was made, or why there was none.
+        Why the last visit was chosen, or why none was.
     running
         Assignments in progress, by heliostat.
     finished
@@ -242,14 +243,15 @@ class Scheduler:
     receiver_visits
         The latest receiver visits, which are not chosen here.
     attempts
-        Failed visits, by heliostat; in POSIX s.
+        Failed visits, by heliostat; times in POSIX s.
 
     Raises
     ------
     InputError
-        If there is no target, the names are not those of the design, or a time has no time zone.
+        If there is no target, the names differ from the names in the design, or a time has no time
+        zone.
     UnknownNameError
-        If the mechanisms do not have the model.
+        If the mechanisms do not have the parameters of the model.
     """
 
     def __init__(
@@ -346,9 +348,10 @@ class Scheduler:
         holds: Collection[str] = (),
         weather: Weather | None = None,
     ) -> Assignment | None:
-        """Return the next assignment, noted as in progress; None if none is due, see `reason`.
+        """Return the next assignment, noted as in progress; None if none is due (see `reason`).
 
-        Call `done` or `cancel` when it has ended, after `learn` if it produced a new calibration.
+        Call `done` or `cancel` when the visit has ended; if it produced a new calibration, call
+        `learn` first.
 
         Parameters
         ----------
@@ -409,7 +412,9 @@ class Scheduler:
     # -- results ---------------------------------------------------------------------------
 
     def done(self, visited: Visited) -> Finished | None:
-        """Accept the result of a visit; return it with its assignment, None if it was not planned.
+        """Accept the result of a visit; return it with its assignment.
+
+        Returns None if the visit was not planned.
 
         Raises
         ------
@@ -446,7 +451,7 @@ class Scheduler:
     def prospect(
         self, now_utc: datetime, able: Mask, targets: Sequence[str]
     ) -> FieldProspect | None:
-        """Return the present knowledge, from which to predict the day; None without targets.
+        """Return the present knowledge, for predicting the day; None if there are no targets.
 
         Parameters
         ----------
@@ -489,7 +494,7 @@ class Scheduler:
         holds: Collection[str] = (),
         most: int = 20,
     ) -> list[Assignment]:
-        """Return the next visits, if the sky stays clear and each has the expected result.
+        """Return the next visits, assuming a clear sky and the expected result of each visit.
 
         Parameters
         ----------
@@ -510,7 +515,7 @@ class Scheduler:
         states: States | None = None,
         holds: Collection[str] = (),
     ) -> Iterator[Assignment | None]:
-        """Yield the visits of `plan`, and None in between; each step is at most one decision."""
+        """Yield the visits of `plan`, with None in between; a step makes at most one decision."""
         now = _unix(now_utc)
         end, known = now + horizon.total_seconds(), self._known.copy()
         judge = self._judge.of(known)
@@ -539,7 +544,7 @@ class Scheduler:
                 yield None
 
     def _later(self, now: float) -> float:
-        """Return when to decide again: after a while, or when the sun is up."""
+        """Return when to decide again: after a pause, or when the sun is up."""
         times = now + _STEP * np.arange(1, 145)
         up = solar.position(times, self.design.site).elevation >= self.settings.limits.min_elevation
         return float(times[np.argmax(up)]) if up.any() else float(times[-1])

@@ -38,23 +38,25 @@ class Settings:
     Attributes
     ----------
     model, priors
-        Parameters that are learnt, and standard deviations that replace those of the table.
+        Parameters that are learnt, and standard deviations that replace the values in the table.
     limits
         Limits on the sun elevation, the incidence and the obliquity.
     shots, interval, sigma
-        Number of photographs per visit, s between them, and the standard deviation of a beam, rad.
+        Number of photographs per visit, the time between them, s, and the standard deviation of a
+        beam, rad.
     settle
-        Additional time of a visit, s: until the heliostat is steady, replies, parameters.
+        Additional time of a visit, s: for the heliostat to become steady, for replies, and for
+        writing parameters.
     look
         Time of a further attempt for a beam that is not on the target, s; None: there is no search.
     goal
-        Expected beam error, rad RMS, below which a heliostat is not visited until it is due.
+        Expected beam error, rad RMS, below which a heliostat is not visited until it is overdue.
     worth
         Minimum fraction of the expected squared error that a visit must remove.
     most_age
         Age of a calibration above which its heliostat takes precedence over all gains, s.
     retry
-        Wait after a failed visit, s; doubled each time, until it is given up (`VISITS`).
+        Wait after a failed visit, s; doubled each time, until the heliostat is given up (`VISITS`).
     glare
         Minimum angle between the sun and a camera's line of sight to its target, rad.
     most_hidden
@@ -103,7 +105,7 @@ class Settings:
         return self.settle + self.shots * self.interval
 
     def closed(self, sun: FloatArray, weather: Weather) -> str | None:
-        """Return the reason why no photograph is possible with this sun and weather, or None."""
+        """Return why no photograph is possible in this sun and weather; None if one is."""
         elevation = float(np.arcsin(np.clip(sun[2], -1.0, 1.0)))
         if elevation < self.limits.min_elevation:
             lowest = np.degrees(self.limits.min_elevation)

@@ -2,9 +2,9 @@
 
 Begin with `CalibrationCycle`: it sends a heliostat to a target, takes photographs (directly, or
 with a search for the beam: `Centring`), fits them, and updates the plant's belief if the
-calibration is better. `JointCycle` calibrates several heliostats on one target at once, identified
-by their movements; `ReceiverCycle` does so on a receiver, while they track it. `Visit` is the
-travel to the target and back; `TargetCamera` is the protocol of a camera.
+calibration is better. `JointCycle` calibrates several heliostats on one target at once, and
+identifies them by their movements; `ReceiverCycle` does this on a receiver, while the heliostats
+track it. `Visit` is the travel to the target and back; `TargetCamera` is the protocol of a camera.
 """
 
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult

@@ -7,9 +7,9 @@ calibration is sent to the local controller, read back, and adopted as the helio
 Nothing is sent after too few sightings, a fit that did not converge, values far outside the range
 of a plausible installation, or a fit with a larger error than before; the heliostat then keeps its
 present calibration. A first calibration, a large change, and a calibration from photographs that
-the present one did not expect are confirmed by one more photograph before they are adopted; if it
-contradicts them, the old parameters are sent back. The confirming photograph is included in the
-learning afterwards.
+the present calibration did not predict are confirmed by one more photograph before they are
+adopted; if this photograph contradicts them, the old parameters are sent back. The confirming
+photograph is included in the learning afterwards.
 """
 
 from collections.abc import Awaitable, Callable
@@ -75,14 +75,14 @@ class CycleResult:
     outcome
         Whether the heliostat has a new calibration, or why not.
     text
-        The same for display, one line.
+        The outcome in words, for display, in one line.
     rejected
         Why photographs were not used, in words.
     known, new
         Number of sightings now known for the heliostat, and how many of them this visit added.
     measured
         Beam error in this visit's photographs under the previous calibration, rad RMS; NaN if there
-        is none.
+        was no previous calibration or no photograph.
     before, after
         Beam error over all sightings under the previous calibration and after the fit, rad RMS; NaN
         without a fit.
@@ -105,7 +105,7 @@ class CycleResult:
     verdict: Verdict | None = None
 
     def then(self, again: "CycleResult") -> "CycleResult":
-        """Return the result combined with that of learning from the verification, ``again``."""
+        """Return this result combined with ``again``, the result of the verification."""
         new, known = self.new + again.new, max(self.known, again.known)
         if again.record is None:
             return replace(self, known=known, new=new)
@@ -128,14 +128,14 @@ def refused(mandate: Mandate, heliostat: str, text: str) -> CycleResult:
 
 @dataclass(frozen=True)
 class Leaving:
-    """How a heliostat that tracks a receiver leaves the receiver, only to store new parameters.
+    """How a heliostat leaves the receiver that it tracks, only to store new parameters.
 
     Attributes
     ----------
     worth
         Smallest change of its beam that justifies leaving, rad.
     leave
-        Function that brings it to standby.
+        Function that brings the heliostat to standby.
     """
 
     worth: float
@@ -170,7 +170,7 @@ class CalibrationCycle:
     unhidden
         As given.
     verification
-        Confirms new parameters.
+        Verifies new parameters with a photograph.
     """
 
     def __init__(
@@ -199,10 +199,10 @@ class CalibrationCycle:
     async def run(
         self, person: Person, token: int, heliostat: str, target: str, tell: Tell | None = None
     ) -> CycleResult:
-        """Calibrate one heliostat, and return it to where it was: standby, or its aim.
+        """Calibrate one heliostat, and return it to standby or to its aim, where it was before.
 
-        It works under its own mandate and continues whoever takes the command authority in the
-        meantime. An operator's order to the heliostat ends it.
+        The visit works under its own mandate, and continues whoever takes the command authority in
+        the meantime. An operator's order to the heliostat ends the visit.
 
         Parameters
         ----------
@@ -233,7 +233,7 @@ class CalibrationCycle:
     async def search(
         self, person: Person, token: int, heliostat: str, target: str, tell: Tell | None = None
     ) -> CycleResult:
-        """Search for the beam of one heliostat on a target, using the camera; change nothing.
+        """Search for the beam of one heliostat on a target with the camera; learn nothing.
 
         The parameters are those of `run`.
         """
@@ -253,12 +253,12 @@ class CalibrationCycle:
         return CycleResult(heliostat, CalibrationOutcome.UNCHANGED, text)
 
     def _missed(self, heliostat: str, taken: Photographs) -> float:
-        """Return the beam error of photographs under the present belief, rad RMS."""
+        """Return the beam error of photographs under the present calibration, rad RMS."""
         seen = join([self._sighting(shot, counts) for shot, counts in taken.used])
         return root_mean_square(beam_errors(self._plant.beliefs.present(heliostat), seen).beam)
 
     def _witness(self, heliostat: str, taken: Photographs) -> str | None:
-        """Check the sun direction by photographs; return the reason not to learn from them."""
+        """Check the sun direction by photographs; return why they must not be used, or None."""
         if not taken.used:
             return None
         beliefs = self._plant.beliefs
@@ -293,7 +293,7 @@ class CalibrationCycle:
     async def alone(
         self, target: Target, heliostat: str, shot: Shot, standing: Standing | None
     ) -> Shot:
-        """Return a shot corrected for obstruction by neighbours; see `Unhidden.shot`."""
+        """Return a shot, corrected for obstruction by neighbours; see `Unhidden.shot`."""
         if self.unhidden is None:
             return shot
         return await self.unhidden.shot(target, heliostat, shot, standing)
@@ -313,7 +313,7 @@ class CalibrationCycle:
         Parameters
         ----------
         visit, taken
-            Its visit, and the photographs.
+            The heliostat's visit, and the photographs.
         tell
             Called with the name of each step.
         confirming
@@ -321,9 +321,9 @@ class CalibrationCycle:
         least
             Minimum number of sightings for the fit; None: as in the settings.
         leaving
-            Set if the heliostat tracks a receiver, which it leaves only if its parameters change. A
-            change that a photograph must confirm is left to a visit to a target. None: the
-            heliostat is at standby.
+            How the heliostat leaves the receiver that it tracks, which it does only if its
+            parameters change. A change that a photograph must confirm is left to a visit to a
+            target. None: the heliostat is at standby.
         """
         fewest = self.settings.least if least is None else least
         confirm, say = confirming or self.verification.problem, tell or _nobody
@@ -340,7 +340,7 @@ class CalibrationCycle:
         return result
 
     async def _again(self, visit: Visit, proof: Photographs, tell: Tell, least: int) -> CycleResult:
-        """Learn from a photograph that confirmed a fit; what was adopted stays unchanged."""
+        """Learn from a photograph that confirmed a fit; the adopted calibration stays unchanged."""
         confirm = self.verification.problem
         try:
             return await self._learn(visit, proof, tell, confirm, least, None)
@@ -431,7 +431,7 @@ class CalibrationCycle:
     async def _after_leaving(
         self, visit: Visit, fit: JudgedFit, new_sightings: Sightings, leaving: Leaving
     ) -> JudgedFit:
-        """Return the fit for which a heliostat has left a receiver, or why the heliostat stayed."""
+        """Return the fit for which a heliostat has left a receiver, or why it has stayed."""
         if not self._sure(fit, new_sightings):
             text = "a photograph on a target must confirm the new parameters; calibrate it there"
             return replace(fit, outcome=CalibrationOutcome.NOT_VERIFIED, problem=text)
@@ -455,7 +455,7 @@ class CalibrationCycle:
         tell: Tell,
         confirming: Confirming,
     ) -> tuple[JudgedFit, tuple[str, ...]]:
-        """Send a fit and verify it; return it, with why it was withdrawn, and the items sent."""
+        """Send a fit and verify it; return the fit, why it was withdrawn, and the items sent."""
         name, plant = visit.heliostat, self._plant
         present, new = plant.beliefs.present(name), fit.mechanism
         sure = self._sure(fit, new_sightings)

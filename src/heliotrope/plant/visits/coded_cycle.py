@@ -2,8 +2,8 @@
 
 During a series of photographs, each beam moves according to its code (`imaging.coded`); a
 photograph is taken only when all beams have settled. Each identified beam is a sighting, which is
-processed like that of an ordinary visit, with one fit, the same safeguards, and verification. Beams
-that are not identified are reported, and nothing is learnt from them.
+processed like a sighting of an ordinary visit, with one fit, the same safeguards, and verification.
+Beams that are not identified are reported, and nothing is learnt from them.
 
 A visit to a target is a *joint visit*, a visit of heliostats that track a receiver is a *receiver
 visit*. They differ in how beams arrive and leave, in their light, and in the use of new parameters.
@@ -68,16 +68,17 @@ class Light:
     Attributes
     ----------
     view
-        Position of the face in the camera's frames; None: unknown.
+        Position of the surface's face in the camera's frames; None: unknown.
     empty
         The light without beams; None: the surface is never without beams.
     usual, steady
         Mean brightness of photographs, and its largest relative change; None: unlimited.
     other
-        Brightness of the last photograph if unusual.
+        Brightness of the last photograph, if it was unusual.
     lasting
-        Whether the last two photographs agreed at another brightness that is not due to a cloud. In
-        that case beams have arrived or left, and this brightness is the usual one from then on.
+        Whether the last two photographs agreed on a different brightness that is not due to a
+        cloud. In that case beams have arrived or left, and this brightness becomes the usual
+        brightness.
     """
 
     view: FaceView | None = None
@@ -88,7 +89,7 @@ class Light:
     lasting: bool = False
 
     async def shown(self, picture: Exposed) -> bool:
-        """Return whether a photograph has the usual brightness, and update the latter slowly."""
+        """Return whether a photograph has the usual brightness, which is slowly updated."""
         if self.usual is None:
             return True
         level = (await picture.light).brightness
@@ -117,9 +118,11 @@ class _Taken:
         Photographs of the present cycle, each with its number; they are evaluated while the beams
         move on.
     still
-        Start and end of the time at which all were at the aims of a photograph, and its number.
+        Start and end of the time in which all beams were at the aims of a photograph, and the
+        number of the photograph.
     count, first
-        Total number of photographs; and the number with which the present cycle began.
+        Total number of photographs, and the number of the photograph with which the present cycle
+        began.
     standing
         Poses of the field in the middle of the cycle.
     """
@@ -134,7 +137,7 @@ class _Taken:
     @classmethod
     @contextlib.contextmanager
     def of(cls, layout: Layout) -> "Iterator[_Taken]":
-        """Yield a store for the photographs of a layout; at the end, drop unevaluated ones."""
+        """Yield a store for the photographs of a layout; finally drop unevaluated photographs."""
         taken = cls(len(layout.moves))
         try:
             yield taken
@@ -151,7 +154,7 @@ class _Taken:
         return [(number, await one.light) for number, one in self.pictures]
 
     def forget(self) -> None:
-        """Drop all photographs, evaluated or not; a full cycle begins with the next number."""
+        """Drop all photographs, evaluated or not; a full cycle begins with the next photograph."""
         self.first = self.number
         for _, one in self.pictures:
             one.light.cancel()
@@ -168,7 +171,7 @@ class CodedCycle(ABC):
     camera
         Camera of the surfaces.
     cycle
-        Cycle that learns from these sightings as from those of its own visits.
+        Cycle that learns from these sightings as it does from sightings of its own visits.
 
     Attributes
     ----------
@@ -178,7 +181,7 @@ class CodedCycle(ABC):
         Name of a visit, for display.
     comes
         Whether heliostats come to the surface, and return to their aims at the end; otherwise they
-        track it, and their beams move slightly.
+        track the surface, and their beams move slightly.
     settings
         Settings of the plant file.
     """
@@ -196,7 +199,7 @@ class CodedCycle(ABC):
 
     @abstractmethod
     def face(self, name: str) -> Target:
-        """Return the face of a surface; raise UnknownNameError if there is none of that name."""
+        """Return the face of a surface; raise UnknownNameError if there is no such surface."""
 
     @abstractmethod
     def _arranged(self, face: Target, names: tuple[str, ...]) -> Layout:
@@ -206,7 +209,7 @@ class CodedCycle(ABC):
     def _stay(
         self, visit: CodedVisit, layout: Layout, light: Light, tell: Tell
     ) -> AbstractAsyncContextManager[Move]:
-        """Yield the function that moves beams, once they are there and the light is known.
+        """Yield the function that moves beams, once they have arrived and the light is known.
 
         At the end the beams are removed.
         """
@@ -236,10 +239,10 @@ class CodedCycle(ABC):
         where: str,
         tell: Tell = lambda _: None,
     ) -> tuple[CycleResult, ...]:
-        """Calibrate heliostats together, and bring each back to where it was.
+        """Calibrate heliostats together, and return each to where it was.
 
-        It works under its own mandate, and continues whoever takes the command authority in the
-        meantime. A heliostat that an operator commands leaves the visit.
+        The visit works under its own mandate, and continues whoever takes the command authority in
+        the meantime. A heliostat that an operator commands leaves the visit.
 
         Parameters
         ----------
@@ -289,7 +292,8 @@ class CodedCycle(ABC):
 
         Returns
         -------
-            The sighting of each identified beam, and the results of the others, by heliostat.
+            The sighting of each identified beam, and a result for each other heliostat, by
+            heliostat.
         """
         with _Taken.of(layout) as taken:
             async with self._stay(visit, layout, light, tell) as move:
@@ -311,7 +315,7 @@ class CodedCycle(ABC):
         move: Move,
         tell: Tell,
     ) -> None:
-        """Take the photographs, up to the limit that allows for changes of the light.
+        """Take the photographs; their maximum number allows for changes of the light.
 
         When a beam leaves or the light has changed for good, a full cycle of the codes begins
         again. A photograph in unusual light is repeated.
@@ -363,7 +367,10 @@ class CodedCycle(ABC):
             raise RefusedError(f"{self.kind} to {visit.target.name}: no heliostat is left; {why}")
 
     async def _next(self, visit: CodedVisit, light: Light, taken: _Taken) -> Exposed:
-        """Take a photograph; few await evaluation, so an unusable one ends the visit soon."""
+        """Take a photograph.
+
+        Few photographs await evaluation, so an unusable photograph ends the visit soon.
+        """
         if len(taken.pictures) >= _UNREAD:
             await asyncio.shield(taken.pictures[-_UNREAD][1].light)
         return await self._exposed(visit.target, light)
@@ -371,7 +378,7 @@ class CodedCycle(ABC):
     async def _separated(
         self, visit: CodedVisit, layout: Layout, light: Light, taken: _Taken, tell: Tell
     ) -> tuple[dict[str, Photographs], dict[str, CycleResult]]:
-        """Return the sightings of identified beams, and the results of the others."""
+        """Return the sightings of identified beams, and the results of all other heliostats."""
         chosen = [layout.names.index(name) for name in visit.names]
         pictures = await taken.read()
         moves = layout.moves[[number for number, _ in pictures]][:, chosen]
@@ -425,7 +432,7 @@ class CodedCycle(ABC):
         least: int | None = None,
         leaving: Leaving | None = None,
     ) -> CycleResult:
-        """Learn from an identified beam, see `CalibrationCycle.learn`; an error is a result."""
+        """Learn from an identified beam (`CalibrationCycle.learn`); an error becomes a result."""
         try:
             return await self.cycle.learn(
                 visit.visits[name], taken, confirming=confirming, least=least, leaving=leaving

@@ -1,7 +1,7 @@
 """Beams of a coded visit: their positions on a surface, and the codes by which they move.
 
-A beam moves by a few tenths of a milliradian to a few milliradians, or by two drive steps if that
-is more.
+A beam moves by a few tenths of a milliradian to a few milliradians, or by two drive steps if these
+are larger.
 """
 
 from collections.abc import Mapping
@@ -36,8 +36,8 @@ def moments_on(
 ) -> FloatArray:
     """Return the second moments of beams on a target, m², (..., 2, 2).
 
-    They combine the image of the sun, widened by the mirror's slope errors, and the mirror itself,
-    seen along the beam.
+    A beam combines the image of the sun, widened by the mirror's slope errors, and the outline of
+    the mirror as seen along the beam.
 
     Parameters
     ----------
@@ -80,12 +80,12 @@ class Layout:
     codes
         Number of different codes.
     powers
-        Expected power of each beam, in any common unit, (M,); a beam with another power is joined
-        with other light. None: the expected powers are not compared.
+        Expected power of each beam, in any common unit, (M,); a beam with a different power is
+        mixed with other light. None: the powers are not compared.
     first
         Whether new parameters are verified by a further series of photographs.
     left_out
-        Why other heliostats do not take part, by name.
+        Why the remaining heliostats do not take part, by name.
     """
 
     target: Target
@@ -99,7 +99,7 @@ class Layout:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The heliostats."""
+        """The names of the heliostats."""
         return tuple(beam.heliostat for beam in self.beams)
 
     def points(self, photograph: int) -> dict[str, FloatArray]:
@@ -108,7 +108,7 @@ class Layout:
         return dict(zip(self.names, self.aims + move @ self.target.axes, strict=True))
 
     def start(self) -> dict[str, FloatArray]:
-        """Return the aims without movement, by name."""
+        """Return the aims before any movement, by name."""
         return dict(zip(self.names, self.aims, strict=True))
 
 
@@ -121,7 +121,7 @@ class SentBeam:
     slant
         Slant range, m.
     moments, likely
-        Its largest and its likely second moments, m², (2, 2).
+        Largest and likely second moments of the beam, m², (2, 2).
     variance
         Variance of its position along each axis, m².
     power
@@ -138,7 +138,7 @@ class SentBeam:
     step: FloatArray
 
     def movement(self, angle: float, axes: slice = slice(None)) -> float:
-        """Return the size of a movement along some axes, m; larger if the steps are coarse."""
+        """Return the size of a movement along some axes, m; it is larger for coarse steps."""
         return max(angle * self.slant, LEAST_STEPS * float(self.step[axes].max()))
 
 
@@ -149,7 +149,7 @@ def beams_of(
     settings: CodedSettings,
     aims: Mapping[str, FloatArray] | None = None,
 ) -> tuple[dict[str, SentBeam], dict[str, str]]:
-    """Return the known beams, and why others cannot be on a surface, by heliostat.
+    """Return the known beams, and why other beams cannot be on a surface, by heliostat.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def beams_of(
     errors
         Expected error of each beam, rad RMS (2-D); NaN if it does not reach the target.
     settings
-        Settings of the visit; the movements must not need to be larger than they allow.
+        Settings of the visit, which limit the size of the movements.
     aims
         Aims of the heliostats, ENU, m, each (3,); None: the centre.
     """
@@ -209,18 +209,18 @@ def coded(
     movement: float,
     along: int | None = None,
 ) -> Layout:
-    """Return the layout of beams at places (M, 2) that move by codes (M,).
+    """Return the layout of M beams at given places, (M, 2), which move by given codes, (M,).
 
     Parameters
     ----------
     target, known
         The target, and what is known about the M beams, by name.
     places, code
-        Places in m right of and above the centre; and numbers of the codes.
+        Places, m right of and above the centre, and code numbers.
     movement
         Amplitude in both directions, rad; larger for a beam that follows its aim in coarse steps.
     along
-        The only axis of the movements; None: both axes.
+        The only axis of the movements; None: the beams move along both axes.
     """
     count = int(code.max(initial=0)) + 1
     axes = slice(None) if along is None else slice(along, along + 1)

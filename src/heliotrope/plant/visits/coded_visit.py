@@ -1,10 +1,10 @@
 """Several heliostats at one target or receiver: their travel there, their aims, and their return.
 
 A heliostat that is refused, is lost or leaves its aim drops out: it is brought to standby, or its
-beam is moved off the target, and the others continue. They also continue when an operator's order
-removes a heliostat from the visit; that heliostat is left to the operator. The visit ends only for
-reasons that affect all: an emergency, the end of its mandate, a cancelled task. All beams then
-leave the target.
+beam is moved off the target, and the remaining heliostats continue. They also continue when an
+operator's order removes a heliostat from the visit; the visit does not move that heliostat again.
+The visit ends only for reasons that affect all heliostats: an emergency, the end of its mandate, a
+cancelled task. All beams then leave the target.
 """
 
 import asyncio
@@ -28,7 +28,7 @@ Pointing = Callable[[Person, int, Mapping[str, FloatArray]], Ticket]
 
 #: Time limits for an order, and for the path to standby, s.
 _ORDER, _HOME = 60.0, 120.0
-#: A goal that has just moved with the sun leaves an axis at most this far from it, rad.
+#: A goal that has just moved with the sun is at most this far from its axis, rad.
 _STEP = 1e-3
 #: When all but this fraction of heliostats are at their aims, the others are allowed as long again
 #: plus this time, s.
@@ -56,7 +56,7 @@ class CodedVisit(BroughtHome):
     visits
         Visits of the participants, by name.
     lost
-        Why others do not take part, by name.
+        Why the remaining heliostats do not take part, by name.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class CodedVisit(BroughtHome):
         return found
 
     async def go(self, points: Mapping[str, FloatArray], limit: float) -> None:
-        """Send all to their points on the target, ENU, and wait until they are there.
+        """Send all heliostats to their points on the target, ENU, m, and wait until they arrive.
 
         Raises
         ------
@@ -132,7 +132,7 @@ class CodedVisit(BroughtHome):
         await self._obeyed("TRACK", self._command("TRACK"), self.missing(states.TRACKING), limit)
 
     async def aim(self, points: Mapping[str, FloatArray], limit: float = _ORDER) -> None:
-        """Send aims to the participants; those that may not have their aims drop out."""
+        """Send aims to the participants; participants whose aims are refused drop out."""
         await self._pointed(self.plant.aim, points, limit)
 
     async def move(self, points: Mapping[str, FloatArray], limit: float) -> None:
@@ -156,14 +156,15 @@ class CodedVisit(BroughtHome):
     async def _obeyed(
         self, what: str, order: Order, heliostats: Iterable[str], limit: float
     ) -> None:
-        """Issue an order; heliostats that do not carry it out drop out, see `carried_out`."""
+        """Issue an order; heliostats that do not carry it out drop out (see `carried_out`)."""
         failed = await carried_out(self.plant, order, heliostats, limit, self.look)
         self.drop({name: f"{what} {name}: {why}" for name, why in failed.items()})
 
     async def _arrived(self, limit: float) -> None:
-        """Wait until all stay at their aims in two reports; those that do not arrive drop out.
+        """Wait until all participants stay at their aims in two reports; the rest drop out.
 
-        Once most have arrived, the others are allowed the same time again plus some seconds.
+        Once most participants have arrived, the remaining ones are allowed the same time again plus
+        some seconds.
         """
         begin = self.plant.now()
         until, seen = begin + limit, dict.fromkeys(self.visits, (begin, 0))
@@ -202,7 +203,7 @@ class CodedVisit(BroughtHome):
         return bool(gone)
 
     async def home(self) -> None:
-        """Bring all to standby; those that do not go are moved off the target (DEFOCUS).
+        """Bring all participants to standby; any that do not go are moved off the target (DEFOCUS).
 
         Raises
         ------
@@ -213,9 +214,9 @@ class CodedVisit(BroughtHome):
             await self._standby(tuple(sorted(self._away)))
 
     async def _standby(self, names: tuple[str, ...]) -> None:
-        """Bring heliostats to standby; those that an order has moved off the target stay there.
+        """Bring heliostats to standby, except any that an order has moved off the target.
 
-        Those that another order has removed from the visit are left to that order.
+        Heliostats that another order has removed from the visit are not moved.
         """
         taken = self.mandate.taken
         self._away -= taken.keys()
@@ -243,8 +244,8 @@ class CodedVisit(BroughtHome):
 class Returned:
     """Heliostats that return to their previous aims at the end of an ``async with``.
 
-    Heliostats that are not at standby then, and those that another order has removed from the
-    visit, stay where they are. A cancelled visit leaves all at standby.
+    Heliostats that are not at standby at the end, and heliostats that another order has removed
+    from the visit, stay where they are. A cancelled visit leaves all heliostats at standby.
 
     Parameters
     ----------
@@ -265,11 +266,11 @@ class Returned:
         }
 
     async def __aenter__(self) -> Self:
-        """Record their present aims."""
+        """Record the present aims of the heliostats."""
         return self
 
     async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Send them back; an error that ended the visit takes precedence over a later one."""
+        """Send the heliostats back; an error that ended the visit takes precedence."""
         if kind is None:
             await self._back()
         elif issubclass(kind, Exception):

@@ -11,7 +11,7 @@ from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant.visits.visit import Visit
 
-#: Step counts that differ from those of the ordered movements by this fraction do not follow them.
+#: Step counts that differ from the ordered movements by this fraction do not follow the movements.
 _FOLLOWS = 0.5
 #: Number of step-count reports that a sighting needs.
 _LEAST_ROWS = 3
@@ -29,15 +29,15 @@ class CountsHeard:
     name
         Name of the heliostat.
     armature, drives
-        Its row of the tables, (1, …).
+        The heliostat's rows of the tables, (1, …).
     counts
         Reported step counts, (R, 2).
     aims
-        Its aim at each report, ENU, m, (R, 3).
+        Aim of the heliostat at each report, ENU, m, (R, 3).
     base
-        Its aim without movement, ENU, m, (3,).
+        Aim of the heliostat without movement, ENU, m, (3,).
     suns
-        Unit vectors to the sun at the reports, and at the time of the counts in question, (R + 1,
+        Unit vectors to the sun at the reports, and at the time for which counts are wanted, (R + 1,
         3).
     """
 
@@ -64,11 +64,11 @@ class CountsHeard:
         visit
             Visit of the heliostat.
         base
-            Its aim without movement, ENU, m, (3,).
+            Aim of the heliostat without movement, ENU, m, (3,).
         still
-            Periods in which it was at rest at an aim, monotonic s, and that aim, (3,).
+            Periods in which the heliostat was at rest at an aim, monotonic s, and that aim, (3,).
         middle
-            Time of the counts in question.
+            Time for which counts are wanted.
         """
         plant, row = visit.plant, slice(visit.row, visit.row + 1)
         times, counts = visit.counted
@@ -89,7 +89,7 @@ class CountsHeard:
         )
 
     def at_rest(self) -> FloatArray | str:
-        """Return the step counts at the aim without movement, (2,), or why they are unknown."""
+        """Return the step counts at the aim without movement, (2,), or why these are unknown."""
         count = len(self.counts)
         if count < _LEAST_ROWS:
             return f"its step counts were heard {count} times at its aims; {_LEAST_ROWS} needed"

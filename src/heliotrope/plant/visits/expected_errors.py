@@ -18,7 +18,7 @@ def expected_errors(
 ) -> FloatArray:
     """Return the expected errors of K beams at their present aims, rad RMS (2-D), (K,).
 
-    Arguments and NaN are as in `expected_covariances`.
+    For the arguments, and for results of NaN, see `expected_covariances`.
     """
     spread = expected_covariances(plant, heliostats, aims, model)
     return np.asarray(np.sqrt(np.trace(spread, axis1=-2, axis2=-1)))
@@ -32,8 +32,9 @@ def expected_covariances(
 ) -> FloatArray:
     """Return the covariances of the errors of K beams at their present aims, rad², (K, 2, 2).
 
-    The axes point right and up at the aim, as seen from the mirror. NaN for a beam that cannot
-    reach its aim, and for a heliostat that was never calibrated and has no ``model``.
+    The axes point right and up at the aim, as seen from the mirror. The covariance is NaN for a
+    beam that cannot reach its aim, and for a heliostat that was never calibrated and has no
+    ``model``.
 
     Parameters
     ----------

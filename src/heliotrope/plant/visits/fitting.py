@@ -63,10 +63,10 @@ class JudgedFit:
         The sightings, photographs first; the estimated shared errors of the flights are removed.
     before, after
         Beam errors under the present and the fitted mechanism, weighted by the sightings, rad RMS.
-        A fit that follows the drift need not explain the past; only the last day's photographs
-        count.
+        A fit that follows the drift need not explain the past, so only the last day's photographs
+        are used.
     outcome, problem
-        Verdict on the fit, and the reason if it is rejected, empty if not.
+        Verdict on the fit, and why it is rejected ("" if it is not rejected).
     name
         Name of the heliostat.
     flown
@@ -102,7 +102,7 @@ class JudgedFit:
         provenance: Provenance = Provenance.CAMERA,
         campaign: str = "",
     ) -> HeliostatCalibration:
-        """Return the record of this fit for `Beliefs`, which already hold its photographs."""
+        """Return the record of this fit for `Beliefs`, which already contain its photographs."""
         known, last = beliefs.known(self.name), beliefs.record(self.name)
         photographs = np.zeros(0, np.int64) if known is None else known.identities
         return HeliostatCalibration.from_fit(
@@ -123,7 +123,7 @@ class JudgedFit:
 
 @dataclass(frozen=True)
 class Believed:
-    """What is believed about one heliostat when it is fitted: an immutable copy.
+    """An immutable copy of what is believed about one heliostat when it is fitted.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class Believed:
     nominal, present
         The mechanism of the design, and the mechanism believed now, batch shape (1,).
     hyper
-        Hyperparameters of its group; None: not learnt yet.
+        Hyperparameters of its group; None: they have not been learnt yet.
     flights
         Drone flights.
     """
@@ -155,10 +155,11 @@ def fit_heliostat(
 ) -> JudgedFit:
     """Return the fit of one heliostat, by a model, to its photographs and its flight records.
 
-    The fit follows photographs and flight records through the drift to the latest of them, and must
-    explain those of the last day, because apparent outliers may come from a mirror that moved an
-    hour ago. If constant parameters explain them better, the constants are proposed. Flight records
-    share errors with other heliostats, which the joint fit of constants takes into account.
+    The fit follows all photographs and flight records through the drift up to the latest. It must
+    explain the sightings of the last day, because apparent outliers may come from a mirror that
+    moved an hour ago. If constant parameters explain these sightings better, the constants are
+    proposed. Flight records share errors with other heliostats, which the joint fit of constants
+    takes into account.
     """
     if believed.name in believed.flights:
         (constants,) = _fit_group(
@@ -177,7 +178,7 @@ def _following(
     joint: JudgedFit,
     photographed: Sightings | None,
 ) -> JudgedFit:
-    """Return the fit that follows the drift of a heliostat with flight records, or constants."""
+    """Return the fit of a heliostat with flight records: following the drift, or constant."""
     sightings, flown = joint.sightings, believed.flights.flown(believed.name)
     photographs = sightings.take(np.zeros(0, np.intp)) if photographed is None else photographed
     moving = model.following(believed.nominal, photographs, joint.fitted, believed.hyper, flown)
@@ -194,7 +195,7 @@ def _better(
     still: FieldFit,
     moving: FieldFit,
 ) -> JudgedFit:
-    """Return the fit that follows the drift if it explains the last day, else the constants."""
+    """Return the fit that follows the drift if it explains the last day, else the constant fit."""
     recent = sightings.take(np.flatnonzero(sightings.time >= sightings.time.max() - DAY))
     errors = [
         root_mean_square(
@@ -209,10 +210,10 @@ def _better(
 
 
 def _room(believed: Believed, settings: CycleSettings, flown: Identities) -> float:
-    """Return the beam error left by motion within hours, which is not followed, rad RMS.
+    """Return the beam error due to motion within hours, which the fit cannot follow, rad RMS.
 
-    For a photograph, its own sigma describes this well enough; a flight record is ten times as
-    precise.
+    For a photograph, its own sigma describes this motion well enough; a flight record is ten times
+    as precise.
     """
     usual = ROOM * settings.sigma
     if not len(flown):
@@ -232,9 +233,9 @@ def fit_flights(
 ) -> dict[str, JudgedFit]:
     """Return the joint fits of many heliostats that share the errors of flights, by name.
 
-    All are fitted with the model for few sightings; a calibration visit chooses a model for each
-    heliostat. A heliostat whose fit is wrong does not contribute to the shared errors, so the
-    others are fitted again without it.
+    All heliostats are fitted with the model for few sightings; a calibration visit chooses a model
+    for each heliostat. A heliostat whose fit is wrong must not contribute to the shared errors, so
+    all other heliostats are fitted again without it.
     """
     fits_by_name: dict[str, JudgedFit] = {}
     groups: dict[int, list[str]] = {}
@@ -261,7 +262,7 @@ def fit_flights(
 def follow_flights(
     beliefs: Beliefs, flights: Flights, settings: CycleSettings, fits: Mapping[str, JudgedFit]
 ) -> dict[str, JudgedFit]:
-    """Return the fits of `fit_flights` followed through the drift, by name.
+    """Return the fits of `fit_flights`, continued through the drift, by name.
 
     Each fit replays all sightings of its heliostat.
     """
@@ -405,7 +406,7 @@ def _judge(
 
 
 def change_of(present: Mechanism, new: Mechanism, made: Sightings) -> float:
-    """Return the largest beam change by new parameters at the counts of sightings, rad."""
+    """Return the largest beam change due to new parameters at the step counts of sightings, rad."""
     normals = [m[made.heliostat].pose(made.counts).normal for m in (present, new)]
     return 2.0 * float(angle_between(*normals).max())
 

@@ -1,6 +1,7 @@
 """The joint visit: several heliostats come to one target, and leave before evaluation.
 
-The empty target is photographed first. New parameters are learnt as after an ordinary visit.
+The empty target is photographed first. New parameters are learnt in the same way as after an
+ordinary visit.
 
 Uncalibrated heliostats go together, each with its own code. Heliostats that have stored their first
 parameters return together, and a second series of photographs must find each beam at the position
@@ -36,8 +37,8 @@ from heliotrope.plant.visits.photographs import Photographs, Shot, Tell
 from heliotrope.plant.visits.target_light import Exposed, LightCamera, light_on
 from heliotrope.plant.visits.visit import Visit
 
-#: Number of sightings that a first fit needs, since all photographs of a visit agree, and others
-#: verify the fit.
+#: Number of sightings that a first fit needs. One is enough, since all photographs of a visit
+#: agree, and further photographs verify the fit.
 _FIRST = 1
 #: Verdicts on a new heliostat whose beam may be beside the target; light that does not move at its
 #: place may come from another heliostat.
@@ -98,7 +99,7 @@ class JointCycle(CodedCycle):
         """Record from the result of a joint or single visit whether the heliostat may join again.
 
         If the beams of all new heliostats miss the target, the target is as dark as under a cloud.
-        The search therefore continues at the next position, and a cloud does not end it.
+        Darkness therefore does not end the search; it continues at the next position.
         """
         name, now, text = result.heliostat, self._plant.now(), result.text
         new = self._plant.beliefs.record(name) is None
@@ -116,18 +117,18 @@ class JointCycle(CodedCycle):
             self.attempts.give_up(name, text, now)
 
     def first(self, heliostats: Sequence[str], target: Target) -> bool:
-        """Return whether a visit uses individual codes: some are new, or poorly known."""
+        """Return whether a visit needs individual codes for new or poorly known heliostats."""
         errors = errors_on(self._plant, target, heliostats, self.settings).values()
         return bool(self.settings.first) and not all(e <= self.settings.known for e in errors)
 
     def having_place(self, heliostats: Sequence[str], target: str) -> tuple[str, ...]:
-        """Return which of some heliostats have a place in a visit now."""
+        """Return which of some heliostats can have a place in a visit now."""
         return self._arranged(self.face(target), tuple(heliostats)).names
 
     # -- a visit ---------------------------------------------------------------------------
 
     def face(self, name: str) -> Target:
-        """Return a target; raise UnknownNameError if there is none of that name."""
+        """Return a target; raise UnknownNameError if there is no such target."""
         return self._plant.design.target(name)
 
     def _arranged(self, face: Target, names: tuple[str, ...]) -> Layout:
@@ -192,7 +193,7 @@ class _Waiting:
     fitted, nominal
         The fit of batch shape (1,), and the mechanism from which it starts.
     problem
-        Future with the reason why the fit is not confirmed, None if it is.
+        Future with the reason why the fit is not confirmed; None if it is confirmed.
     """
 
     visit: Visit
@@ -214,10 +215,10 @@ class _Waiting:
 
 
 class _Verification:
-    """The verification of a joint first visit: a further series of photographs of all together.
+    """The verification of a joint first visit: a further series of photographs of all beams.
 
     The fits of the visit end one after the other. Each heliostat that stores new parameters waits
-    until all the others do, or have ended otherwise; then they are verified together.
+    until all other heliostats have stored theirs or dropped out; then all are verified together.
 
     Parameters
     ----------
@@ -268,7 +269,7 @@ class _Verification:
             self._complete.set()
 
     async def make(self) -> None:
-        """Verify the waiting heliostats once no more can come; a failure applies to all of them."""
+        """Verify the waiting heliostats once no others can come; a failure applies to all."""
         await self._complete.wait()
         try:
             await self._confirm()
@@ -278,11 +279,11 @@ class _Verification:
                     one.problem.set_exception(error)
 
     async def _confirm(self) -> None:
-        """Verify new parameters; the sightings of confirmed heliostats are stored in `seen`.
+        """Verify new parameters; store the sightings of confirmed heliostats in `seen`.
 
-        Heliostats that would make the target too bright are photographed later. Heliostats hidden
-        by other light come once more, each with its own code. Each series of photographs is
-        conclusive for its heliostats, whatever the next series shows.
+        Heliostats that would make the target too bright are photographed later. Heliostats whose
+        beams are hidden by other light come once more, each with its own code. Each series of
+        photographs is conclusive for its heliostats, whatever the next series shows.
         """
         waits, own = tuple(self._waiting), False
         while waits:
@@ -302,8 +303,8 @@ class _Verification:
 
         Returns
         -------
-            The reason why each is not confirmed, None if it is; the heliostats that may come once
-            more; and those that wait for another series.
+            Why each heliostat is not confirmed (None if it is); the heliostats that may come once
+            more; and the heliostats that wait for another series.
         """
         plant, target = self._visit.plant, self._visit.target
         sun = plant.sun_vector()

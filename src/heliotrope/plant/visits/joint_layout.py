@@ -26,10 +26,10 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.coded_layout import Layout, SentBeam, beams_of, coded
 from heliotrope.plant.visits.expected_errors import expected_errors
 
-#: A beam stays this many of its standard deviations, and of those of its position, from the border.
+#: Distance of a beam from the border, in standard deviations of the beam and of its position.
 _BORDER, _PLACED = 2.0, 3.0
-#: Possible numbers of codes, for 8 to 256 photographs with movements along both axes, for 8 to 128
-#: along one.
+#: Possible numbers of codes: for 8 to 256 photographs with movements along both axes, or for 8 to
+#: 128 with movements along one axis.
 _CODES = (3, 7, 15, 31, 63, 127)
 #: Movements of a verification are up and down; those of first visits are to the right and left.
 _UP = 1
@@ -89,7 +89,7 @@ def verifying(
 ) -> tuple[Layout, tuple[str, ...]]:
     """Return the layout of a joint verification, and the heliostats to be verified later.
 
-    The latter would make the target too bright now.
+    The heliostats to be verified later would make the target too bright now.
 
     Parameters
     ----------
@@ -112,7 +112,10 @@ def verifying(
 def _darkened(
     target: Target, known: dict[str, SentBeam], settings: JointSettings
 ) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return places, and the beams that are too bright, which are removed from ``known``."""
+    """Return places for the beams, and the beams that are too bright.
+
+    Beams that are too bright are removed from ``known``.
+    """
     dazzling: list[str] = []
     while known:
         places = _places(target, known)
@@ -126,7 +129,7 @@ def _darkened(
 def _unknown(
     plant: PlantController, name: str, error: float, settings: JointSettings
 ) -> str | None:
-    """Return the reason why the expected error of a beam is too large, or None."""
+    """Return why the expected error of a beam is too large; None if it is not."""
     if plant.beliefs.record(name) is None:
         return "it has no calibration yet; it is calibrated alone first"
     if error > settings.known:
@@ -146,8 +149,8 @@ def errors_on(
 ) -> dict[str, float]:
     """Return the expected errors of beams on a target, rad RMS (2-D), by heliostat.
 
-    NaN for a heliostat that cannot reach it, or was never calibrated and has no ``model``; see
-    `expected_errors`.
+    The error is NaN for a heliostat that cannot reach the target, or was never calibrated and has
+    no ``model``; see `expected_errors`.
     """
     aims = np.broadcast_to(target.center, (len(heliostats), 3))
     found = expected_errors(plant, heliostats, aims, model)
@@ -177,7 +180,7 @@ def _places(target: Target, known: Mapping[str, SentBeam]) -> FloatArray:
 
 
 def _too_bright(known: Mapping[str, SentBeam], places: FloatArray, limit: float) -> str:
-    """Return the beam at the brightest place if it exceeds a limit, in suns; else "".
+    """Return the beam at the brightest place if this exceeds a limit, in suns; otherwise "".
 
     A single beam may be as bright as in a visit of its own.
     """
@@ -189,7 +192,7 @@ def _too_bright(known: Mapping[str, SentBeam], places: FloatArray, limit: float)
 
 
 def bells(points: FloatArray, places: FloatArray, moments: FloatArray) -> FloatArray:
-    """Return the light of M beams of power 1 at n points of their target, 1/m², (M, n).
+    """Return the light of M beams of unit power at n points on their target, 1/m², (M, n).
 
     Parameters
     ----------
@@ -207,7 +210,10 @@ def bells(points: FloatArray, places: FloatArray, moments: FloatArray) -> FloatA
 def _shared(
     known: Mapping[str, SentBeam], places: FloatArray, along: int | None
 ) -> npt.NDArray[np.intp]:
-    """Return the code of each beam, (M,): the fewest codes that keep beams of one code apart."""
+    """Return the code of each beam, (M,), using the fewest codes.
+
+    Beams with the same code must not overlap.
+    """
     spread = np.array([b.moments + b.variance * np.eye(2) for b in known.values()])
     for few in _CODES if len(known) else ():
         # A series of movements along one axis has twice as many codes.
@@ -276,7 +282,7 @@ def _first_places(target: Target, sent: Mapping[str, SentBeam]) -> FloatArray:
 
 
 def _brightest(target: Target, sent: Mapping[str, SentBeam], places: FloatArray) -> float:
-    """Return the highest light level to be expected anywhere on the target, in suns."""
+    """Return the highest light level expected anywhere on the target, in suns."""
     corners = target.plane_coordinates(target.corners)
     x, y = (np.linspace(low, high, _ACROSS) for low, high in zip(*_ends(corners), strict=True))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -12,7 +12,7 @@ MORE = 1.25
 
 
 class ModelOfEach:
-    """Models by heliostat, kept until many more sightings are available for the choice.
+    """Models by heliostat, each kept until many more sightings are available for a new choice.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class ModelOfEach:
         self._kept: dict[str, tuple[int, OwnModel]] = {}
 
     async def of(self, heliostat: str, nominal: Mechanism, sightings: Sightings) -> OwnModel:
-        """Return the model for all sightings of a heliostat (nominal of batch shape (1,))."""
+        """Return the model for all sightings of a heliostat; ``nominal`` has batch shape (1,)."""
         if self._model != "auto":
             return _given(self._model, nominal)
         count, model = self._kept.get(heliostat, (0, None))

@@ -1,7 +1,7 @@
 """Corrects a photographed centroid for the shift caused by shading and blocking neighbours.
 
 The plant knows the poses of the neighbours, because their step counts are reported and their
-mechanisms are believed. Most mirrors are unobstructed, which a corner test shows at once; the shift
+mechanisms are believed. Most mirrors are unobstructed, as a quick corner test shows; the shift
 of an obstructed mirror takes some milliseconds, and is computed outside the event loop.
 """
 
@@ -77,14 +77,14 @@ class Unhidden:
         target, heliostat
             The target (or receiver face), and the name of the heliostat.
         shot
-            As photographed.
+            The shot as photographed.
         standing
-            Step counts of the field at the exposure; None: unchanged since then.
+            Poses of the field at the exposure; None: the poses have not changed since.
 
         Notes
         -----
         The shift of the centroid is uncertain by a quarter of its size (`calibration.obstruction`),
-        and by all of it if an obstructing neighbour was moving, or did not report for half a
+        and by its full size if an obstructing neighbour was moving, or did not report for half a
         minute. Neighbours whose step counts were never known are left out.
         """
         if shot.reasons or not np.isfinite(shot.point).all():

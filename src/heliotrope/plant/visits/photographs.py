@@ -1,4 +1,4 @@
-"""The photographs of a visit: directly where the beam is, or with search and centring.
+"""The photographs of a visit, taken with or without searching for and centring the beam.
 
 A heliostat that was never calibrated may miss by more than the width of the target. If the first
 photograph shows no light, the aim moves along a square spiral in the target plane until light
@@ -49,7 +49,7 @@ class Shot:
     covariance
         Covariance of the point, m²: a variance or (3, 3).
     reasons
-        Why it cannot be used; () if it can.
+        Why the shot cannot be used; () if it can.
     """
 
     point: FloatArray
@@ -81,9 +81,9 @@ class Photographs:
     used
         Photographs, each with the step counts of the two axes, (2,), at its exposure.
     rejected
-        Why other photographs were not used, in words.
+        Why the remaining photographs were not used, in words.
     found
-        Whether the beam was seen at all.
+        Whether the beam was seen in any photograph.
     """
 
     used: list[tuple[Shot, FloatArray]] = field(default_factory=list)
@@ -100,7 +100,7 @@ class Photographing(Protocol):
 
 
 class Plain:
-    """Photographs of the beam in its present position, without search or centring."""
+    """Photographs of the beam in its present position, without searching or centring."""
 
     def __init__(self, camera: TargetCamera, settings: CycleSettings) -> None:
         self._camera, self._settings = camera, settings
@@ -122,7 +122,7 @@ class Plain:
 
 
 class Centred:
-    """Photographs of a beam that is searched for, centred, and moved over the target."""
+    """Photographs of a beam that is first searched for and centred, then moved over the target."""
 
     def __init__(self, camera: TargetCamera, settings: CycleSettings, centring: Centring) -> None:
         self._camera, self._settings, self._centring = camera, settings, centring
@@ -149,8 +149,8 @@ class Centred:
 
         Returns
         -------
-            Distance by which the beam misses its aim, right and up, m, (2,), None if not found; and
-            why.
+            The distance by which the beam misses its aim, right and up, m, (2,), or None if it was
+            not found; and the reason.
         """
         target = visit.target
         light = await self._find(visit, np.asarray(target.center), tell)
@@ -171,7 +171,7 @@ class Centred:
         return light.place - target.axes @ (light.first - target.center), ""
 
     async def _find(self, visit: Visit, before: FloatArray, tell: Tell) -> "_Light | None":
-        """Search for the beam and bring it near the middle; None if it is not found.
+        """Search for the beam and bring it near the middle; return None if it is not found.
 
         ``before`` is the present aim.
         """
@@ -190,7 +190,7 @@ class Centred:
     async def _centre(
         self, visit: Visit, aim: FloatArray, place: FloatArray, tell: Tell
     ) -> "_Light":
-        """Move the aim by the distance of the beam from the middle."""
+        """Move the aim by the beam's offset from the middle."""
         target = visit.target
         if np.linalg.norm(place) <= self._centring.near * min(target.width, target.height):
             return _Light(aim, aim, place)
@@ -203,7 +203,7 @@ class Centred:
     async def _series(
         self, visit: Visit, light: "_Light", taken: Photographs, tell: Tell
     ) -> FloatArray:
-        """Take the photographs of the beam that was found; end at once if it is another beam.
+        """Take the photographs of the beam that was found; end at once if it is a different beam.
 
         Returns the last aim.
         """
@@ -242,7 +242,7 @@ class Centred:
         return aim
 
     def _astray(self, target: Target, shot: Shot, aim: FloatArray, light: "_Light") -> str | None:
-        """Return the reason why light is not the beam, which moves with its aim."""
+        """Return why light cannot be the beam: it does not move with the aim."""
         place = seen(target, shot)
         if place is None:
             return None if shot.reasons else "no light on the target"
@@ -260,7 +260,7 @@ class Centred:
 
 @dataclass(frozen=True)
 class _Light:
-    """Light first seen at ``place`` (m, (2,)) under aim ``first``; ``aim`` centres it."""
+    """Light first seen at ``place``, m, (2,), with the aim ``first``; ``aim`` would centre it."""
 
     aim: FloatArray
     first: FloatArray
@@ -268,7 +268,7 @@ class _Light:
 
 
 def room_of(visit: Visit, centring: Centring) -> float:
-    """Return how far the beam may be moved off the middle of the target, right and up, m."""
+    """Return how far the beam may be moved from the middle of the target, right and up, m."""
     target, plant, row = visit.target, visit.plant, visit.row
     group, place = plant.design.find(visit.heliostat)
     mirror = 0.5 * math.hypot(float(group.width[place]), float(group.height[place]))
@@ -294,7 +294,8 @@ async def photographed(camera: TargetCamera, visit: Visit) -> Shot:
 async def measured(visit: Visit, shot: Shot) -> tuple[Shot, FloatArray]:
     """Return a shot and the step counts at its exposure, (2,).
 
-    Its point is less certain if an axis may have been taking up its backlash; see `swings`.
+    The point of the shot is less certain if an axis may have been taking up its backlash; see
+    `swings`.
 
     Raises
     ------
@@ -306,7 +307,10 @@ async def measured(visit: Visit, shot: Shot) -> tuple[Shot, FloatArray]:
 
 
 def seen(target: Target, shot: Shot) -> FloatArray | None:
-    """Return where a shot shows light, right of and above the centre, m, (2,), or None."""
+    """Return the position of the light in a shot; None if it shows no light.
+
+    The position is the offsets right of and above the centre, m, (2,).
+    """
     if not np.isfinite(shot.point).all():
         return None
     place = target.plane_coordinates(shot.point)

@@ -1,4 +1,4 @@
-"""The receiver visit: heliostats that track a receiver are measured while they do.
+"""The receiver visit: heliostats are measured while they track a receiver.
 
 A few dozen heliostats that track the receiver move their beams by a milliradian, each by its own
 code, while all others keep tracking. A camera observes the receiver. The movements are ordinary
@@ -70,7 +70,7 @@ class ReceiverCycle(CodedCycle):
         self.settings = settings
 
     def face(self, name: str) -> Target:
-        """Return the face of a receiver; raise UnknownNameError if there is none of that name."""
+        """Return the face of a receiver; raise UnknownNameError if there is no such receiver."""
         return self._plant.design.receiver(name).face
 
     def _arranged(self, face: Target, names: tuple[str, ...]) -> Layout:
@@ -94,7 +94,7 @@ class ReceiverCycle(CodedCycle):
             await visit.look()
 
     async def _exposed(self, face: Target, light: Light) -> Exposed:
-        """Photograph the receiver: the mean of several frames."""
+        """Photograph the receiver; the photograph is the mean of several frames."""
         frames = [
             await light_on(self._camera, face, light.view) for _ in range(self.settings.exposures)
         ]
@@ -137,7 +137,7 @@ class ReceiverCycle(CodedCycle):
         return await of_each(proven, one)
 
     async def _steady(self, face: Target, light: Light, tell: Tell) -> float:
-        """Return the brightness of the receiver; refuse if it changes."""
+        """Return the brightness of the receiver; raise an error if it changes."""
         tell("is the sun steady?")
         seen = []
         for _ in range(_LOOKS):

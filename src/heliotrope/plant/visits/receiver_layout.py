@@ -113,7 +113,7 @@ def caught(face: Target, place: FloatArray, moments: FloatArray) -> float:
 
 
 def _cost(face: Target, place: FloatArray, beam: SentBeam, settings: ReceiverSettings) -> float:
-    """Return the light that a beam's movements cost, in suns m²."""
+    """Return the light that a beam's movements cost, in suns · m²."""
     ends = place + beam.movement(settings.movement) * _ENDS
     moved = float(np.mean([caught(face, end, beam.likely) for end in ends]))
     return beam.power * max(0.0, caught(face, place, beam.likely) - moved)

@@ -24,7 +24,7 @@ class CycleSettings:
     least
         Number of sightings that a fit needs, over all visits.
     sigma
-        Standard deviation of a beam excluding that of its centroid, rad, including motion within
+        Standard deviation of a beam, rad, without the error of its centroid but with motion within
         hours. Until it is learnt, half of it is assumed to vary from photograph to photograph.
     most
         Maximum credible deviation of a parameter, in standard deviations of its prior.
@@ -63,7 +63,7 @@ class CycleSettings:
 
     @property
     def first_model(self) -> str | tuple[str, ...]:
-        """The model for a heliostat with few sightings; every later one has its parameters."""
+        """The model for a heliostat with few sightings; every later model has its parameters."""
         return SIMPLE if self.model == "auto" else self.model
 
 
@@ -75,7 +75,7 @@ class Centring:
     ----------
     pitch
         Distance between neighbouring search aims, as a fraction of the shorter side of the target.
-        Malan's value is 0.5, which finds as many beams of any size but takes longer
+        Malan's value is 0.5, which finds the same number of beams of any size but takes longer
         (``examples/malan_search.py``).
     most
         Number of aims to try in addition to the middle.
@@ -85,7 +85,7 @@ class Centring:
     spread
         How far off the middle later photographs are taken, as a fraction of the margin that the
         beam leaves on the target, because sightings that are further apart are more informative. 0:
-        all in the middle.
+        all photographs are taken in the middle.
     slope
         Half the divergence of a beam, rad, in addition to the size of its mirror.
     astray

@@ -2,7 +2,7 @@
 
 An axis that moves down with the sun swings below its goal every few seconds, so as to approach the
 goal from below (`lcu.stepper`). The step counts, reported once per second or less often, miss most
-swings; but the goal drops when each swing begins. If it dropped between the counts before and after
+swings, but the goal drops when each swing begins. If it dropped between the counts before and after
 a photograph, the exposure fell into the swing with a known probability, and the beam may be off by
 as much as the swing. If the axis was reported in the swing next to the exposure, that probability
 is one. If the goal did not drop, the mirror was at its goal.
@@ -51,7 +51,7 @@ def swung(axis: AxisLimits, fall: float, span: float, heard: float = math.inf) -
 
 
 def _lasts(axis: AxisLimits, steps: float) -> float:
-    """Return the time of a motion from rest to rest, s."""
+    """Return the duration of a motion from rest to rest, s."""
     ramp = axis.rate**2 / axis.acceleration
     if steps <= ramp:
         return 2.0 * math.sqrt(steps / axis.acceleration)
@@ -59,14 +59,14 @@ def _lasts(axis: AxisLimits, steps: float) -> float:
 
 
 def spread_at(visit: Visit, instant: float, counts: FloatArray) -> FloatArray:
-    """Return the covariance of a beam on the visit's target due to swings, m², (3, 3).
+    """Return the covariance, due to swings, of a beam on the visit's target, m², (3, 3).
 
     Parameters
     ----------
     visit
         Visit with the reports before and after the instant.
     instant
-        Monotonic s.
+        Instant of the photograph, monotonic s.
     counts
         Step counts at the instant, (2,).
     """

@@ -1,4 +1,4 @@
-"""The light on a surface, seen from its front, and the beams that compose it."""
+"""The light on a surface, as seen from its front, and the beams that it consists of."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
@@ -20,7 +20,7 @@ T = TypeVar("T")
 #: A pixel is left out if it is clipped to at least this degree in any photograph.
 _FULL = 0.01
 #: A beam counts as merged with other light if its power, relative to the size of its mirror,
-#: differs from that of the others by this fraction and by this many standard deviations.
+#: differs from that of the other beams by this fraction and by this many standard deviations.
 _OTHER, _SIGMAS = 0.4, 4.0
 
 
@@ -31,7 +31,7 @@ class TargetLight:
     Attributes
     ----------
     values
-        Brightness over full scale, (H, W), row 0 at the top.
+        Brightness as a fraction of full scale, (H, W), row 0 at the top.
     step
         Size of a pixel, m.
     first
@@ -43,7 +43,7 @@ class TargetLight:
     at
         Middle of the exposure, s of the plant's monotonic clock.
     view
-        Position of the target's face in the frame; None if no frame was taken.
+        Position of the target's face in the frame; None if there is no frame.
     shift
         The target's centre in the plane of the face, m, (2,).
     """
@@ -73,11 +73,11 @@ class TargetLight:
 
     @property
     def brightness(self) -> float:
-        """Mean brightness over full scale, at an exposure of 1."""
+        """Mean brightness as a fraction of full scale, at an exposure of 1."""
         return float(self.values[self.seen].mean()) / self.exposure
 
     def covariance_at(self, place: FloatArray) -> FloatArray:
-        """Return the covariance of a position (2,) on the target by the view error, m², (2, 2)."""
+        """Return the covariance of a position (2,) due to the error of the view, m², (2, 2)."""
         if self.view is None:
             return np.zeros((2, 2))
         return self.view.covariance_at(np.asarray(place) + self.shift)
@@ -116,9 +116,10 @@ def separated(
 
 
 def judged(beams: Sequence[SeparatedBeam], powers: FloatArray) -> list[SeparatedBeam]:
-    """Return beams (M,), marking those as merged whose power does not match their mirror size.
+    """Return the beams, (M,), with those marked as merged whose power does not fit their mirrors.
 
-    The apparent brightness of the mirrors is not known in advance, but it is the same for all.
+    The apparent brightness of the mirrors is not known in advance, but is assumed to be the same
+    for all mirrors.
 
     Parameters
     ----------
@@ -151,7 +152,7 @@ class Exposed:
     at
         Middle of the exposure, s of the plant's monotonic clock.
     light
-        Future light on the target; it raises the reason if there is none.
+        Future that returns the light on the target, or raises the reason why there is none.
     """
 
     at: float
@@ -184,12 +185,12 @@ async def light_on(
 
 
 async def noting(look: Callable[[], Awaitable[None]], made: Awaitable[T]) -> T:
-    """Return the result of work, polling the heliostats in the meantime.
+    """Return the result of some work; poll the heliostats in the meantime.
 
     Raises
     ------
     HeliotropeError
-        Raised by the work.
+        If the work raises it.
     """
     found: list[T | HeliotropeError] = []
 

@@ -2,8 +2,8 @@
 
 A fit explains whatever the photographs show, stray light as well as the beam. The heliostat
 therefore returns to the target with its new parameters, to a position away from all earlier
-photographs, and its beam must be where they predict it. The photograph tests a fit that has not
-used it; once it has confirmed the fit, it becomes a sighting like any other.
+photographs, and its beam must be where these parameters predict. The photograph tests a fit that
+has not used it; once it has confirmed the fit, it becomes a sighting like any other.
 """
 
 import asyncio
@@ -42,7 +42,7 @@ class Confirming(Protocol):
     async def __call__(
         self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
     ) -> str | None:
-        """Return the reason why they are not confirmed; see `Verification.problem`."""
+        """Return why the parameters are not confirmed; see `Verification.problem`."""
         ...
 
 
@@ -53,7 +53,7 @@ class Prediction:
     Attributes
     ----------
     miss
-        Distance, rad of beam.
+        Distance as a beam angle, rad.
     reach
         Standard deviation of the distance in the direction of the miss, rad.
     deviations
@@ -118,21 +118,21 @@ class Verification:
         self._confirmed: dict[str, Photographs] = {}
 
     def confirmed(self, heliostat: str) -> Photographs | None:
-        """Return the photograph that confirmed the last fit of a heliostat, once; None if none."""
+        """Return the photograph that confirmed a heliostat's last fit, only once; else None."""
         return self._confirmed.pop(heliostat, None)
 
     def judge(
         self, nominal: Mechanism, fitted: FieldFit, shot: Shot, counts: FloatArray
     ) -> str | None:
-        """Return the reason why a shot with its step counts does not confirm a fit."""
+        """Return why a shot, with its step counts, does not confirm a fit."""
         return self._judge(nominal, fitted, self._sighting(shot, counts))
 
     async def problem(
         self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
     ) -> str | None:
-        """Return the reason why the new parameters are not confirmed, None if they are.
+        """Return why the new parameters are not confirmed; None if they are.
 
-        The heliostat already stores them. It is at standby before and after.
+        The heliostat already stores the new parameters. It is at standby before and after.
 
         Parameters
         ----------
@@ -191,7 +191,7 @@ class Verification:
 def apart(target: Target, points: list[FloatArray], room: float) -> FloatArray:
     """Return the aim on a target that is farthest from points already photographed, (3,).
 
-    Stray light that does not move cannot be at the predicted position of the beam there.
+    At this aim, stray light that does not move cannot be where the beam is predicted.
 
     Parameters
     ----------

@@ -1,8 +1,9 @@
 """A heliostat's visit to a target: travel there, the observed stay, and the return.
 
-Whatever a visit takes it releases on every exit: the place on the target (`BroughtHome`), the lock
-for writing parameters (`Visit.locked`), the aim and the receiver (`joint_visit.Returned`). If it
-cannot, the plant does so later: see `plant.orders.giving_back`.
+A visit releases everything that it has taken on every exit: the place on the target
+(`BroughtHome`), the lock for writing parameters (`Visit.locked`), the aim and the receiver
+(`joint_visit.Returned`). If the visit cannot release something, the plant does so later; see
+`plant.orders.giving_back`.
 """
 
 import asyncio
@@ -46,26 +47,26 @@ async def carried_out(
     limit: float,
     look: Callable[[], Awaitable[None]],
 ) -> dict[str, str]:
-    """Issue an order to heliostats and wait until it is done; return those that fail, and why.
+    """Issue an order to heliostats and wait until it is done; return which fail, and why.
 
-    A reason that clears within seconds does not end a visit: the order is repeated to a heliostat
-    that was refused for such a reason (`refusals.SOON`), until nothing has changed for `SILENT` s.
+    An order that is refused for a reason that clears within seconds (`refusals.SOON`) does not end
+    a visit: it is repeated until nothing has changed for `SILENT` s.
 
     Parameters
     ----------
     plant, heliostats
         The plant, and the names.
     order
-        Function that issues the order to some of them.
+        Function that issues the order to some of the heliostats.
     limit
-        Time within which it must be done once it is accepted, s.
+        Time within which the order must be done once it is accepted, s.
     look
         Function that waits a little between two attempts.
 
     Raises
     ------
     RefusedError
-        If the plant refuses every motion; or as ``look``.
+        If the plant refuses every motion, or ``look`` raises it.
     """
     failed: dict[str, str] = {}
     left, until = tuple(heliostats), plant.now() + SILENT
@@ -92,7 +93,7 @@ async def carried_out(
 
 
 class BroughtHome(ABC):
-    """A visit that uses fine steps in its ``async with``, and then is brought home."""
+    """A visit that uses fine steps within its ``async with``, then brings its heliostats home."""
 
     plant: PlantController
 
@@ -106,13 +107,16 @@ class BroughtHome(ABC):
         """Bring the heliostats home, or off the target; raise RefusedError if the plant refuses."""
 
     async def __aenter__(self) -> Self:
-        """Begin the visit; at its end the heliostats are brought home."""
+        """Begin the visit."""
         self._fine = self.plant.stepping.fine(self.names)
         self._fine.__enter__()
         return self
 
     async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Bring the heliostats home; a cancelled visit ends as cancelled even if refused."""
+        """Bring the heliostats home.
+
+        A cancelled visit ends as cancelled even if the plant refuses the motion.
+        """
         try:
             await self.home()
         except RefusedError:
@@ -159,7 +163,7 @@ class Visit(BroughtHome):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The heliostat."""
+        """The name of the heliostat."""
         return (self.heliostat,)
 
     @property
@@ -217,14 +221,14 @@ class Visit(BroughtHome):
 
     @asynccontextmanager
     async def locked(self) -> AsyncIterator[None]:
-        """Lock the heliostat, which is at standby, for a block, and bring it back to standby.
+        """Lock the heliostat, which is at standby, during a block; bring it back to standby.
 
         Parameters are exchanged only while nothing can move.
 
         Raises
         ------
         RefusedError
-            See `command`. If it cannot be unlocked now, the plant unlocks it later.
+            See `command`. If the heliostat cannot be unlocked now, the plant unlocks it later.
         """
         await self.command("LOCK")
         try:
@@ -252,8 +256,8 @@ class Visit(BroughtHome):
         Raises
         ------
         RefusedError
-            If it is neither at standby nor tracking, a command is refused, or it does not
-            arrive within ``limit`` s.
+            If the heliostat is neither at standby nor tracking, a command is refused, or the
+            heliostat does not arrive within ``limit`` s.
         """
         state = self.state
         if state not in states.AVAILABLE:
@@ -291,7 +295,7 @@ class Visit(BroughtHome):
         return self.left() < ARRIVED and not coarse
 
     def left(self) -> float:
-        """Return how far the axes are from their goals, rad, for the axis that is further away."""
+        """Return the distance of the axes from their goals, rad; the larger of the two."""
         node = self.plant.field.rows[self.row]
         here = np.array([node["primary"], node["secondary"]], dtype=np.float64)
         goal = np.array([node["primary_goal"], node["secondary_goal"]], dtype=np.float64)
@@ -328,14 +332,15 @@ class Visit(BroughtHome):
     async def counts_at(self, instant: float, limit: float = 10.0) -> FloatArray:
         """Return the step counts at an instant, interpolated between adjacent reports, (2,).
 
-        Only reports at the goals count. An axis that moves down with the sun swings below its goal
-        from time to time, so as to approach from below; a report from such a moment is not valid
-        for the next second.
+        Only reports with both axes at their goals are used. An axis that moves down with the sun
+        swings below its goal from time to time, so as to approach from below; a report from such a
+        moment is not valid for the next second.
 
         Raises
         ------
         RefusedError
-            If it was not reported at its goals before, and within ``limit`` s after.
+            If the heliostat was not reported at its goals both before the instant and within
+            ``limit`` s after it.
         """
         until = self.plant.now() + limit
         while not (sum(self._there) > 1 and self._heard_there()[-1] >= instant):
@@ -354,10 +359,10 @@ class Visit(BroughtHome):
         return np.asarray(counts[after - 1] + share * (counts[after] - counts[after - 1]))
 
     def fell(self, instant: float) -> tuple[FloatArray, float]:
-        """Return how far the goals dropped around an instant, steps, (2,), and in what time, s.
+        """Return how far the goals dropped around an instant, steps, (2,), and over what time, s.
 
-        This is between the reports before and after the instant that `counts_at` has used and
-        awaited.
+        The drop is measured between the reports before and after the instant, for which `counts_at`
+        has waited.
         """
         times = self._heard_there()
         goals = [row for row, there in zip(self._goals, self._there, strict=True) if there]
@@ -365,7 +370,10 @@ class Visit(BroughtHome):
         return goals[after - 1] - goals[after], times[after] - times[after - 1]
 
     def heard_moving(self, instant: float) -> float:
-        """Return the time from an instant to the nearest report away from its goals, s, or inf."""
+        """Return the time from an instant to the nearest report away from the goals, s.
+
+        Returns infinity if there is no such report.
+        """
         rows = zip(self._times, self._there, strict=True)
         return min((abs(at - instant) for at, there in rows if not there), default=math.inf)
 
@@ -375,19 +383,19 @@ class Visit(BroughtHome):
 
     @property
     def counted(self) -> tuple[FloatArray, FloatArray]:
-        """The recorded times, monotonic s, (R,), and step counts, (R, 2)."""
+        """The recorded times, monotonic s, (R,), and the step counts at these times, (R, 2)."""
         return np.array(self._times), np.array(self._counts).reshape(-1, 2)
 
     def taken_off(self) -> None:
-        """Move its beam off if another order has left it at an aim with unverified parameters."""
+        """Move the beam off if an order has left it at an aim with unverified parameters."""
         state = int(self.plant.field.rows["state"][self.row])
         if state in states.ON_AIM:
             self.plant.defocus(f"visit of {self.mandate.person.name}", (self.heliostat,))
 
     async def home(self) -> None:
-        """Bring it back to standby or, if that is not possible, move its beam off the target.
+        """Bring the heliostat back to standby or, failing that, move its beam off the target.
 
-        A heliostat that another order has removed from the visit is left to that order.
+        A heliostat that another order has removed from the visit is not moved.
         """
         if not self.away:
             return

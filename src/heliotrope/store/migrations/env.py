@@ -1,4 +1,4 @@
-"""Run by Alembic; uses the connection that `Database.migrate` passes."""
+"""Alembic runs this module, which uses the connection that `Database.migrate` passes."""
 
 from alembic import context
 

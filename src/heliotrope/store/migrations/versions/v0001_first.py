@@ -1,6 +1,7 @@
 """The first tables.
 
-A copy of `store.tables` at that time, because a migration must not change with the program.
+This module is a copy of `store.tables` at that time, because a migration must not change with the
+program.
 """
 
 from alembic import op
@@ -88,7 +89,7 @@ parameter_version = Table(
     _text("code"),
 )
 
-#: Which sightings a version was fitted to, in their order, and what they missed by.
+#: The sightings to which a version was fitted, in order, and their residuals.
 parameter_sighting = Table(
     "parameter_sighting",
     metadata,
@@ -267,5 +268,5 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Make the tables."""
+    """Create the tables."""
     metadata.create_all(op.get_bind(), checkfirst=False)

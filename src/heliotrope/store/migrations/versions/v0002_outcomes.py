@@ -1,4 +1,4 @@
-"""Outcomes by name, the origin of a calibration, and sightings left out of a fit."""
+"""Stores outcomes by name, the origin of a calibration, and sightings left out of a fit."""
 
 from alembic import op
 from sqlalchemy import Boolean, Column, Text, column, false, table, true, update
@@ -15,7 +15,7 @@ _ENDINGS = {
 
 
 def upgrade() -> None:
-    """Add the columns, and name what stood there as a sentence."""
+    """Add the columns, and convert outcomes stored as sentences to names."""
     op.add_column(
         "parameter_version", Column("provenance", Text, nullable=False, server_default="camera")
     )
@@ -28,6 +28,6 @@ def upgrade() -> None:
     version = table("parameter_version", column("outcome", Text))
     for text, name in _ENDINGS.items():
         op.execute(update(version).where(version.c.outcome == text).values(outcome=name))
-    # Only fits that ended well were ever kept; other words are of imported records.
+    # Only fits that ended well were ever kept; other words come from imported records.
     known = list(dict.fromkeys(_ENDINGS.values()))
     op.execute(update(version).where(version.c.outcome.not_in(known)).values(outcome="converged"))

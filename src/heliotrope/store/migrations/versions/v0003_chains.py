@@ -45,7 +45,7 @@ def _digest(before: str, content: list[Any]) -> str:
 
 
 def upgrade() -> None:
-    """Make the links."""
+    """Create the links."""
     connection = op.get_bind()
     metadata.create_all(connection, checkfirst=False)
     _link_events(connection)

@@ -8,7 +8,7 @@ down_revision = "0003"
 
 
 def upgrade() -> None:
-    """Make the table; passwords that are in use already need no change."""
+    """Create the table; passwords already in use need not be changed."""
     op.create_table(
         "password_due",
         Column(

@@ -1,7 +1,7 @@
-"""The sightings behind calibration versions, from one version to another.
+"""The sightings behind calibration versions, each stored from its first to its last version.
 
-Until then every version listed all its sightings, although each builds on those of the previous
-version.
+Before this revision, every version listed all its sightings, although each version builds on the
+sightings of the previous version.
 """
 
 from alembic import op
@@ -52,8 +52,8 @@ parameter_sighting = Table(
     ForeignKeyConstraint(["heliostat", "version"], [version.c.heliostat, version.c.version]),
 )
 
-#: Versions of a heliostat in a row that rest on a sighting alike have one difference between the
-#: number of the version and that of the row.
+#: Successive versions of a heliostat that use a sighting in the same way have the same difference
+#: between version number and row number.
 _RUNS = """
 CREATE TABLE behind AS
 SELECT heliostat, sighting, used, MIN(version) AS version, MAX(version) AS last
@@ -89,7 +89,7 @@ FROM rows_behind
 
 
 def upgrade() -> None:
-    """Name each sighting once for all versions in a row that rest on it alike."""
+    """Store each sighting once for all successive versions that use it in the same way."""
     op.execute(_RUNS)
     op.execute(_ROWS)
     op.drop_table("parameter_sighting")

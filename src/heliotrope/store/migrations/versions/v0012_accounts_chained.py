@@ -22,7 +22,7 @@ account_link = Table(
 
 
 def upgrade() -> None:
-    """Make the links."""
+    """Create the links."""
     connection = op.get_bind()
     metadata.create_all(connection, checkfirst=False)
     before, made = "0" * 64, []
