@@ -538,6 +538,10 @@ class AutomaticControl:
         """Return a mask of the wanted heliostats that automatic control may move, (N,)."""
         return np.asarray(self._raising.wanted & ~self._left_alone())
 
+    def joinable(self) -> npt.NDArray[np.bool_]:
+        """Return a mask of the heliostats that can go to the receiver; see `Raising.joinable`."""
+        return self._raising.joinable()
+
     @property
     def visiting(self) -> frozenset[str]:
         """The heliostats in visits."""
