@@ -35,3 +35,11 @@ def test_no_backlog_builds_up_while_no_heliostat_can_come() -> None:
     heating = Heating(RATE, WINDOW)
     assert heating.allowed(0.0, CELL) == 20.0
     assert heating.allowed(600.0, CELL) == 20.0
+
+
+def test_before_the_night_the_flux_falls_along_the_ramp() -> None:
+    heating = Heating(RATE, WINDOW)
+    heating.note(0.0, np.full(CELL, 100.0))
+    assert heating.allowed(0.0, CELL, 80.0) == 120.0, "not yet"
+    assert heating.allowed(40.0, CELL, 40.0) == 80.0
+    assert heating.allowed(80.0, CELL, 0.0) == 0.0

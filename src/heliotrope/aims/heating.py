@@ -1,5 +1,7 @@
 """The flux up to which a receiver may be heated, cell by cell, along an allowed ramp."""
 
+import math
+
 import numpy as np
 
 from heliotrope.geometry import FloatArray, as_float
@@ -38,8 +40,14 @@ class Heating:
         self._had = [(then, had) for then, had in self._had if at - then <= WARM]
         self._had.append((at, flux))
 
-    def allowed(self, now: float, shape: tuple[int, int]) -> FloatArray:
-        """Return the flux up to which the cells may be heated now, W/m², (rows, columns)."""
+    def allowed(
+        self, now: float, shape: tuple[int, int], remaining: float = math.inf
+    ) -> FloatArray:
+        """Return the flux up to which the cells may be heated now, W/m², (rows, columns).
+
+        ``remaining``: time until the field is stowed, s; the flux falls to 0 until then, along the
+        same ramp.
+        """
         had = [flux for at, flux in self._had if now - at <= WARM]
         warm = as_float(np.max(had, axis=0)) if had else np.zeros(shape)
         line = warm + self._rate * self._window
@@ -47,4 +55,4 @@ class Heating:
             then, before = self._line
             line = np.maximum(np.minimum(before + self._rate * (now - then), line), warm)
         self._line = now, as_float(line)
-        return as_float(line)
+        return as_float(np.minimum(line, self._rate * max(remaining, 0.0)))

@@ -12,7 +12,8 @@ With a ramp limit, the flux that the beams would bring in full sun may exceed th
 minute only by the rise allowed in one round (`aims.heating`). Heliostats therefore leave the
 receiver while a cloud covers the sun. When the sun is back, they return as fast as the ramp allows:
 the first round follows at once, further rounds follow shortly while heliostats wait for the ramp,
-and only heliostats that stand ready at standby take part in it. If the measured flux is above the
+and only heliostats that stand ready at standby take part in it. Before the sun is so low that
+automatic control stows the field, they leave along the same ramp. If the measured flux is above the
 limit, the limit of the cells concerned is lowered by the ratio of the measured to the predicted
 flux, so that the same moves relieve them.
 """
@@ -61,6 +62,8 @@ BLOCKED = 300.0
 BRIGHT = 1.15
 #: The sun shines above this fraction of the irradiance under a usual clear sky.
 SUNNY = 0.5
+#: Step of the search for the time at which the field stows, s.
+STEP = 10.0
 #: Time between two rounds while heliostats wait for the ramp, s.
 SOON = 3.0
 #: Time for which a limit stays lowered after a measured flux was above it, s.
@@ -336,7 +339,23 @@ class Aiming:
         measured = self._measured_dni(now)
         bright = max(BRIGHT * self._clear_sky(), 1.0, np.nan_to_num(measured))
         scale = scene.dni / min(scene.dni, bright)
-        return as_float(scale * self._heating.allowed(now, surface_in(scene).shape))
+        allowed = self._heating.allowed(now, surface_in(scene).shape, self._before_night())
+        return as_float(scale * allowed)
+
+    def _before_night(self) -> float:
+        """Return the time until the sun is so low that the field stows, s; inf: not soon.
+
+        Soon is as long as the ramp takes from the limit to zero.
+        """
+        assert self._settings.limit is not None
+        lowest = math.sin(self._automatic.lowest)
+        longest = float(np.max(self._settings.limit.flux)) / self._settings.ramp
+        longest += 2.0 * self._settings.every  # a round takes effect in the next
+        ahead = np.arange(0.0, longest + STEP, STEP)
+        low = [self._plant.sun_vector(float(time))[2] < lowest for time in ahead]
+        if low[0] or not any(low):
+            return math.inf
+        return max(float(ahead[low.index(True)]) - 2.0 * self._settings.every, 0.0)
 
     def _clear_sky(self) -> float:
         """Return the irradiance under a usual clear sky, W/m²."""

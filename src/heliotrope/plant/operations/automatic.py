@@ -534,6 +534,11 @@ class AutomaticControl:
         """Why nothing is moved now, empty if heliostats may be moved."""
         return self._why_idle() or ""
 
+    @property
+    def lowest(self) -> float:
+        """Elevation of the sun below which the field is stowed, rad."""
+        return self._settings.lowest
+
     def movable(self) -> npt.NDArray[np.bool_]:
         """Return a mask of the wanted heliostats that automatic control may move, (N,)."""
         return np.asarray(self._raising.wanted & ~self._left_alone())
