@@ -177,19 +177,7 @@ def next_round(now: Round, **light: Any) -> Answer:
     """
     rows, columns = surface_in(now.scene).shape
     limit = now.demand.limit.on(rows, columns)
-    fixed, room = np.zeros_like(limit), limit
-    stays = np.isfinite(now.fixed).all(axis=1)
-    if stays.any():
-        engine = FieldFlux(_posed(now.scene, now.fixed), **light)
-        fixed = engine.maps[0]
-        room = limit - fixed - _risk(engine, now.demand, limit).above
-        if (room <= 0.0).any():
-            raise InputError(
-                f"aims: {int(stays.sum())} beams whose aims are kept, by an operator or for their "
-                "return from a visit, bring up to "
-                f"{100.0 * float((1.0 - room / limit).max()):.0f} % of the limit; move some of "
-                "them, or raise the limit"
-            )
+    fixed, room = _room(now, limit, light)
     best = _best(now, replace(now.demand, limit=type(now.demand.limit)(room)), light)
     target_aims = np.where((now.free & ~best.defocused)[:, None], best.aims, np.nan)
     engine = FieldFlux(_posed(now.scene, now.aims), **light)
@@ -221,6 +209,30 @@ def next_round(now: Round, **light: Any) -> Answer:
         remaining,
         waiting,
     )
+
+
+def _room(now: Round, limit: FloatArray, light: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
+    """Return the flux of the beams that stay, and the room that they leave under the limit.
+
+    Raises
+    ------
+    InputError
+        If they leave none.
+    """
+    fixed, room = np.zeros_like(limit), limit
+    stays = np.isfinite(now.fixed).all(axis=1)
+    if stays.any():
+        engine = FieldFlux(_posed(now.scene, now.fixed), **light)
+        fixed = engine.maps[0]
+        room = limit - fixed - _risk(engine, now.demand, limit).above
+        if (room <= 0.0).any():
+            raise InputError(
+                f"aims: {int(stays.sum())} beams whose aims are kept, by an operator or for their "
+                "return from a visit, bring up to "
+                f"{100.0 * float((1.0 - room / limit).max()):.0f} % of the limit; move some of "
+                "them, or raise the limit"
+            )
+    return fixed, as_float(room)
 
 
 def steps(
