@@ -26,6 +26,8 @@ from heliotrope.optics.scene import Scene
 #: Limit over the peak, seconds cold and greatest gap.
 BUDGET = {0.7: (1.5, 1e-3), 0.5: (4.0, 2.5e-3)}
 WARM = 0.3
+#: By how much the peak must be below that of image-size priority.
+LESS = 0.15
 OWN, SHARED = 7e-4, SharedErrors(drift=2e-4, clock=1.0, cluster=3e-4)
 LIGHT = {"sun": "pillbox"}
 
@@ -49,7 +51,9 @@ def measure(name: str, given: Scene, share: float) -> Row:
     later = replace(given, sun=direction(azimuth, np.arcsin(given.sun[2])))
     warm, warm_wall, warm_work = timed(lambda: aim_scene(later, demand, start=cold, **LIGHT))
     other = aim_scene(given, demand, strategy="image-size", **LIGHT)
-    powers = [each.engine.powers[0] for each in (cold, other)]
+    image_size_peak = float(other.engine.maps[0].max())
+    below = aim_scene(given, Demand(FluxLimit((1.0 - LESS) * image_size_peak)), **LIGHT)
+    powers = [each.engine.powers[0] for each in (cold, other, below)]
     return {
         "field": name,
         "mirrors": len(given.mirrors),
@@ -63,7 +67,8 @@ def measure(name: str, given: Scene, share: float) -> Row:
         "warm_gap_percent": 100.0 * warm.choice.gap,
         "power_mw": 1e-6 * powers[0],
         "image_size_mw": 1e-6 * powers[1],
-        "image_size_peak_of_limit": float(other.engine.maps[0].max()) / (share * peak),
+        "image_size_peak_of_limit": image_size_peak / (share * peak),
+        "power_lost_for_15_percent_less_peak_percent": 100.0 * (1.0 - powers[2] / powers[1]),
     }
 
 

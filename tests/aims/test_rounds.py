@@ -121,3 +121,20 @@ def test_a_lost_cluster_makes_room_for_others_and_the_safe_spread_holds() -> Non
     safe = true_flux(answer.safe)
     assert 0.3 * limit < safe.max() <= limit
     assert not np.isfinite(answer.safe[lost]).any()
+
+
+def test_mirrors_join_along_the_ramp_before_others_move() -> None:
+    limit, half = 0.7 * PEAK, np.arange(COUNT) % 4 == 0
+    best = followed(NONE, next_round(given(limit, NONE)), 1.01 * limit)
+    aims = np.where(half[:, None], np.where(np.isfinite(best), PLATE.center, np.nan), np.nan)
+    now = true_flux(aims)
+    answer = next_round(given(limit, aims, ramp=now + 0.1 * PEAK))
+    assert 0 < answer.waiting < answer.left
+    after = aims
+    for move in answer.moves:
+        assert not half[move.rows].any(), "who shines stays while others wait for the ramp"
+        after = moved(after, move)
+    assert (true_flux(after) <= now + 0.101 * PEAK).all()
+    free = next_round(given(limit, aims, ramp=now + PEAK))
+    assert free.waiting == 0
+    assert any(half[move.rows].any() for move in free.moves)

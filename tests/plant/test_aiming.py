@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -289,6 +290,42 @@ def test_the_receiver_is_heated_in_steps_at_the_start_and_after_a_cloud() -> Non
             shining.cancel()
 
     played(scene, sensors=(DNI_READING,), ramp=ramp / every)
+
+
+def test_before_the_night_the_field_leaves_along_the_ramp(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ramp, every, ahead = 30e3, 15.0, 75.0
+
+    async def scene(made: LivePlant) -> None:
+        sky = Sky(made)
+        async with asyncio.TaskGroup() as group:
+            shining = group.create_task(sky.shine())
+            await asyncio.sleep(130.0)
+            end = made.plant.now() + ahead
+            monkeypatch.setattr(
+                aiming.Aiming, "_before_night", lambda self: end - self._plant.now()
+            )
+            seen = [await greatest(made, every) for _ in range(6)]
+            assert seen[0] > 1.5 * ramp
+            assert np.diff(seen).min() >= -1.4 * ramp, seen
+            assert seen[-1] <= 0.5 * ramp, seen
+            shining.cancel()
+
+    played(scene, sensors=(DNI_READING,), ramp=ramp / every)
+
+
+@pytest.mark.parametrize(("lowest", "before"), [(0.2, np.inf), (0.3, 40.0), (0.4, np.inf)])
+def test_the_ramp_ends_two_rounds_before_the_sun_is_too_low(lowest: float, before: float) -> None:
+    # The sine of the sun's elevation falls from 0.35 by 0.05 in 70 s.
+    limit, every = FluxLimit(LIMIT), 15.0
+    settings = AimSettings("limit", limit, ramp=LIMIT / 60.0, every=every)
+    heights = SimpleNamespace(sun_vector=lambda ahead: [0.0, 0.0, 0.35 - 0.05 * ahead / 70.0])
+    part = SimpleNamespace(
+        _settings=settings, _automatic=SimpleNamespace(lowest=np.arcsin(lowest)), _plant=heights
+    )
+    found = aiming.Aiming._before_night(part)  # type: ignore[arg-type]
+    assert found == pytest.approx(before, abs=aiming.STEP)
 
 
 def test_a_measured_flux_relieves_the_spot_and_a_lying_sensor_does_nothing(

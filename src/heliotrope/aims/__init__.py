@@ -6,7 +6,7 @@
 - `candidates` and `optimiser`: images of each mirror at a few aims, and the choice that maximises
   power.
 - `errors`: the uncertainty of the flux due to each mirror's own error and to shared errors.
-- `ramp`: when each mirror joins along a ramp.
+- `ramp`: when each mirror joins along a ramp; `heating`: how far a receiver may be heated now.
 - `scene_aims`: aims for a scene; `plan`: aims for a plant; `strategies`: simpler strategies for
   comparison.
 

@@ -129,7 +129,9 @@ class Answer:
         Upper bound on the power that still better aims could add, as a fraction of the planned
         power.
     left
-        Mirrors that do not yet have their best aims.
+        Mirrors whose aims are not yet the best ones.
+    waiting
+        Mirrors that only the ramp keeps from joining.
     """
 
     moves: tuple[Move, ...]
@@ -141,6 +143,7 @@ class Answer:
     power: float
     gap: float
     left: int
+    waiting: int = 0
 
     @property
     def excess(self) -> float:
@@ -175,35 +178,23 @@ def next_round(now: Round, **light: Any) -> Answer:
     """
     rows, columns = surface_in(now.scene).shape
     limit = now.demand.limit.on(rows, columns)
-    fixed, room = np.zeros_like(limit), limit
-    stays = np.isfinite(now.fixed).all(axis=1)
-    if stays.any():
-        engine = FieldFlux(_posed(now.scene, now.fixed), **light)
-        fixed = engine.maps[0]
-        room = limit - fixed - _risk(engine, now.demand, limit).above
-        if (room <= 0.0).any():
-            raise InputError(
-                f"aims: {int(stays.sum())} beams whose aims are kept, by an operator or for their "
-                "return from a visit, bring up to "
-                f"{100.0 * float((1.0 - room / limit).max()):.0f} % of the limit; move some of "
-                "them, or raise the limit"
-            )
+    fixed, room = _room(now, limit, light)
     best = _best(now, replace(now.demand, limit=type(now.demand.limit)(room)), light)
     target_aims = np.where((now.free & ~best.defocused)[:, None], best.aims, np.nan)
     engine = FieldFlux(_posed(now.scene, now.aims), **light)
     above = _risk(engine, now.demand, room).above
     power, better = engine.powers[0], best.engine.powers[0]
-    cap = room - np.maximum(above, best.risk.above)
+    cap = limit_cap = as_float(room - np.maximum(above, best.risk.above))
     full = ((engine.maps[0] + above) / room).max() > 1.0 + HOLDS
     if now.ramp is not None:
         # The ramp is no limit that must hold with a probability.
         warm = now.ramp - fixed
         full = full or (engine.maps[0] > (1.0 + HOLDS) * np.maximum(warm, 0.0) + 1.0).any()
-        cap = np.minimum(cap, warm)
+        cap = np.minimum(limit_cap, warm)
     moves: tuple[Move, ...] = ()
-    remaining = 0
+    remaining = waiting = 0
     if full or better > (1.0 + BETTER) * power or not now.free[_aimed(now.aims)].all():
-        moves, remaining = steps(now, target_aims, as_float(cap), light)
+        moves, remaining, waiting = steps(now, target_aims, as_float(cap), limit_cap, light)
     shown = FieldFlux(_posed(now.scene, np.where(now.shining[:, None], now.aims, np.nan)), **light)
     risk = _risk(shown, now.demand, limit)
     safe = _safe(now, room, light)
@@ -217,37 +208,72 @@ def next_round(now: Round, **light: Any) -> Answer:
         power,
         best.choice.gap,
         remaining,
+        waiting,
     )
+
+
+def _room(now: Round, limit: FloatArray, light: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
+    """Return the flux of the beams that stay, and the room that they leave under the limit.
+
+    Raises
+    ------
+    InputError
+        If they leave none.
+    """
+    fixed, room = np.zeros_like(limit), limit
+    stays = np.isfinite(now.fixed).all(axis=1)
+    if stays.any():
+        engine = FieldFlux(_posed(now.scene, now.fixed), **light)
+        fixed = engine.maps[0]
+        room = limit - fixed - _risk(engine, now.demand, limit).above
+        if (room <= 0.0).any():
+            raise InputError(
+                f"aims: {int(stays.sum())} beams whose aims are kept, by an operator or for their "
+                "return from a visit, bring up to "
+                f"{100.0 * float((1.0 - room / limit).max()):.0f} % of the limit; move some of "
+                "them, or raise the limit"
+            )
+    return fixed, as_float(room)
 
 
 def steps(
-    now: Round, target_aims: FloatArray, cap: FloatArray, light: dict[str, Any]
-) -> tuple[tuple[Move, ...], int]:
-    """Return the moves towards target aims (H, 3), and how many mirrors remain.
+    now: Round,
+    target_aims: FloatArray,
+    cap: FloatArray,
+    limit_cap: FloatArray,
+    light: dict[str, Any],
+) -> tuple[tuple[Move, ...], int, int]:
+    """Return the moves towards target aims (H, 3), how many mirrors remain, and wait for the ramp.
 
-    ``cap`` is the allowable expected flux, W/m², (rows, columns).
+    ``cap`` is the allowable expected flux, W/m², (rows, columns), and ``limit_cap`` what it would
+    be without the ramp.
     """
     aimed, goes = _aimed(now.aims), _aimed(target_aims)
     if not aimed.any() and now.ramp is None:
-        # No beam is on the receiver, so all mirrors may take their best aims at once.
-        return ((Move(np.flatnonzero(goes), target_aims[goes]),) if goes.any() else ()), 0
+        # No mirror shines, so all may take their best aims at once.
+        moves = [Move(np.flatnonzero(goes), target_aims[goes])] if goes.any() else []
+        return tuple(moves), 0, 0
     taken = aimed & ~now.free
     path = _Path(now, target_aims, light)
-    moves = (
-        [Move(np.flatnonzero(taken), np.full((int(taken.sum()), 3), np.nan))] if taken.any() else []
-    )
+    moves = [_rest(np.flatnonzero(taken))] if taken.any() else []
     have = aimed & now.free
     differs = have != goes
     differs |= have & goes & (np.linalg.norm(now.aims - target_aims, axis=1) > ALIKE)
     todo = np.flatnonzero(differs & ~taken)
-    if now.ramp is not None:
+    walk = _Walk(path, path.flux(have), as_float(np.maximum(cap, 0.0).T), now)
+    waiting = 0
+    if now.ramp is None:
+        moves += walk.through(todo, target_aims)
+    else:
+        # Mirrors join first; others move meanwhile only if the ramp is not what mirrors wait for.
         # Neighbours one after the other would heat the same cells first.
         todo = todo[np.argsort((todo * GOLDEN) % 1.0, kind="stable")]
-    flux, cap = path.flux(have), as_float(np.maximum(cap, 0.0).T)
-    walk = _Walk(path, flux, cap, now)
-    moves += walk.through(todo, target_aims)
+        moves += walk.through(todo[~have[todo]], target_aims)
+        waiting = walk.waiting(todo[~have[todo]], as_float(np.maximum(limit_cap, 0.0).T))
+        if not waiting:
+            moves += walk.through(todo[have[todo]], target_aims)
     moves += walk.relieved(np.flatnonzero(have & ~np.isin(np.arange(len(have)), walk.done)))
-    return tuple(moves), len(todo) - len(np.intersect1d(todo, walk.done))
+    return tuple(moves), len(todo) - len(np.intersect1d(todo, walk.done)), waiting
 
 
 def _rest(rows: Rows) -> Move:
@@ -348,6 +374,13 @@ class _Walk:
         full = self._flux > BINDS * self._cap
         stuck.sort(key=lambda row: -float(paths[row][0][full].sum()))
         return stuck[: min(self._now.together, self._now.most - self._moved)]
+
+    def waiting(self, joins: Rows, limit_cap: FloatArray) -> int:
+        """Return how many mirrors do not join, although each could without the ramp."""
+        most = (1.0 + HOLDS) * limit_cap
+        rows = np.setdiff1d(joins, self.done)[:LOOKED]
+        after = (self._flux + self._path.images.of(int(row), -1) for row in rows)
+        return sum(bool((flux <= most).all()) for flux in after)
 
     def relieved(self, rows: Rows) -> list[Move]:
         """Rest mirrors, the most effective first, until no cell is above the limit.

@@ -9,10 +9,13 @@ the limit. If no new aims can be computed, the last good ones stay in force at f
 field goes to the safe spread: fewer heliostats, at the aims of the plant file.
 
 With a ramp limit, the flux that the beams would bring in full sun may exceed the flux of the last
-minute only by the rise allowed in one round. Heliostats therefore leave the receiver while a cloud
-covers the sun, and come back in steps. If the measured flux is above the limit, the limit of the
-cells concerned is lowered by the ratio of the measured to the predicted flux, so that the usual
-moves reduce their flux.
+minute only by the rise allowed in one round (`aims.heating`). Heliostats therefore leave the
+receiver while a cloud covers the sun. When the sun is back, they return as fast as the ramp allows:
+the first round follows at once, further rounds follow shortly while heliostats wait for the ramp,
+and only heliostats that stand ready at standby take part in it. Before the sun is so low that
+automatic control stows the field, they leave along the same ramp. If the measured flux is above the
+limit, the limit of the cells concerned is lowered by the ratio of the measured to the predicted
+flux, so that the same moves relieve them.
 """
 
 import asyncio
@@ -25,6 +28,7 @@ import numpy.typing as npt
 
 from heliotrope.aims import Demand, SharedErrors
 from heliotrope.aims.candidates import surface_in
+from heliotrope.aims.heating import Heating
 from heliotrope.aims.rounds import Answer, Move, Round, next_round
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.field.flux_limit import FluxLimit
@@ -55,10 +59,14 @@ BLUR = 5e-4
 MOVED, SETTLED = 60.0, 4.0
 #: Time for which a heliostat keeps its old aim if its beam may not go to its new one, s.
 BLOCKED = 300.0
-#: A cell may return to a flux at once if it had that flux within this time, s.
-WARM = 60.0
 #: In full sun the irradiance is at most this multiple of that under a usual clear sky.
 BRIGHT = 1.15
+#: The sun shines above this fraction of the irradiance under a usual clear sky.
+SUNNY = 0.5
+#: Step of the search for the time at which the field stows, s.
+STEP = 10.0
+#: Time between two rounds while heliostats wait for the ramp, s.
+SOON = 3.0
 #: Time for which a limit stays lowered after a measured flux was above it, s.
 WARY = 600.0
 #: The safe spread follows when the age of the last good aims exceeds this multiple of the deadline.
@@ -157,8 +165,8 @@ class Aiming:
         self._moved_at = -math.inf
         self._source = self._problem = ""
         self._above = False
-        #: Times, and the flux maps of the receiver then, W/m², at the irradiance of that time.
-        self._had: list[tuple[float, FloatArray]] = []
+        rate, every = self._settings.ramp, self._settings.every
+        self._heating = Heating(rate, every) if rate > 0.0 else None
         #: When a measured flux was above the limit, and by how much.
         self._beyond: list[tuple[float, Beyond]] = []
 
@@ -240,7 +248,20 @@ class Aiming:
                 self._good_at = begun  # nothing moves, so no aims are late
             else:
                 await self._step(begun)
-            await sleep_until(self._plant.clock, begun + self._settings.every)
+            await self._pause(begun)
+
+    async def _pause(self, begun: float) -> None:
+        """Wait until the next round is due, soon if heliostats wait for the ramp in the sun."""
+        clock, due = self._plant.clock, begun + self._settings.every
+        while self._waits_for_ramp and (now := self._plant.now()) < due:
+            if now >= begun + SOON and self._measured_dni(now) > SUNNY * self._clear_sky():
+                return
+            await sleep_until(clock, min(now + 1.0, due))
+        await sleep_until(clock, due)
+
+    @property
+    def _waits_for_ramp(self) -> bool:
+        return self._answer is not None and self._answer.waiting > 0
 
     async def _step(self, now: float) -> None:
         """Compute and send aims; after a failure the last good aims stay in force."""
@@ -286,8 +307,8 @@ class Aiming:
         if not math.isfinite(dni):
             return False
         flux = as_float(answer.flux * (max(dni, 0.0) / present.scene.dni))
-        self._had = [(at, had) for at, had in self._had if present.at - at <= WARM]
-        self._had.append((present.at, flux))
+        if self._heating is not None:
+            self._heating.note(present.at, flux)
         beyond = self._check.beyond(self._settings.limit, flux)
         if beyond is None:
             return False
@@ -312,16 +333,33 @@ class Aiming:
 
     def _ramp(self, now: float, scene: Scene) -> FloatArray | None:
         """Return the flux that the ramp limit allows now, at the scene's irradiance."""
-        if self._settings.ramp <= 0.0:
+        if self._heating is None:
             return None
-        had = [flux for _, flux in self._had]
-        warm = np.max(had, axis=0) if had else np.zeros(surface_in(scene).shape)
-        elevation = math.asin(float(np.clip(scene.sun[2], -1.0, 1.0)))
-        sky = clear_sky(elevation, self._plant.design.site.height)
         measured = self._measured_dni(now)
-        bright = max(BRIGHT * sky, 1.0, measured if math.isfinite(measured) else 0.0)
+        bright = max(BRIGHT * self._clear_sky(), 1.0, np.nan_to_num(measured))
         scale = scene.dni / min(scene.dni, bright)
-        return as_float(scale * (warm + self._settings.ramp * self._settings.every))
+        allowed = self._heating.allowed(now, surface_in(scene).shape, self._before_night())
+        return as_float(scale * allowed)
+
+    def _before_night(self) -> float:
+        """Return the time until the sun is so low that the field stows, s; inf: not soon.
+
+        Soon is as long as the ramp takes from the limit to zero.
+        """
+        assert self._settings.limit is not None
+        lowest = math.sin(self._automatic.lowest)
+        longest = float(np.max(self._settings.limit.flux)) / self._settings.ramp
+        longest += 2.0 * self._settings.every  # a round takes effect in the next
+        ahead = np.arange(0.0, longest + STEP, STEP)
+        low = [self._plant.sun_vector(float(time))[2] < lowest for time in ahead]
+        if low[0] or not any(low):
+            return math.inf
+        return max(float(ahead[low.index(True)]) - 2.0 * self._settings.every, 0.0)
+
+    def _clear_sky(self) -> float:
+        """Return the irradiance under a usual clear sky, W/m²."""
+        elevation = math.asin(float(np.clip(self._plant.sun_vector()[2], -1.0, 1.0)))
+        return clear_sky(elevation, self._plant.design.site.height)
 
     def _measured_dni(self, now: float) -> float:
         """Return the measured irradiance, W/m²; NaN without a recent measurement."""
@@ -373,6 +411,7 @@ class Aiming:
             & ~field.among((states.LOCKED, *OUT_OF_ORDER), now)
         )
         free &= ~self._by_person & (self._blocked_until < now)
+        free &= self._on(now) | self._automatic.joinable()
         free[[field.place(name) for name in self._automatic.visiting]] = False
         return np.asarray(free)
 
@@ -386,6 +425,9 @@ class Aiming:
         plant, settings = self._plant, self._settings
         assert settings.limit is not None
         on, free, allotted = self._on(now), self._movers(now), self._allotted()
+        if self._heating is not None:
+            # A heliostat that cannot come now would keep others from using the ramp.
+            free &= on | plant.field.among((states.IDLE,), now)
         visiting = np.isin(plant.field.names, sorted(self._automatic.visiting))
         # A heliostat that waits for its turn joins at the aim that it was assigned.
         waits = free & ~on & plant.field.among((states.IDLE,), now) & (plant.waiting > 0)

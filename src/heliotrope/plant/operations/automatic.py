@@ -552,9 +552,18 @@ class AutomaticControl:
         """Why nothing is moved now; "" if heliostats may be moved."""
         return self._why_idle() or ""
 
+    @property
+    def lowest(self) -> float:
+        """Elevation of the sun below which the field is stowed, rad."""
+        return self._settings.lowest
+
     def movable(self) -> npt.NDArray[np.bool_]:
         """Return a mask of the wanted heliostats that automatic control may move, (N,)."""
         return np.asarray(self._raising.wanted & ~self._left_alone())
+
+    def joinable(self) -> npt.NDArray[np.bool_]:
+        """Return a mask of the heliostats that can go to the receiver; see `Raising.joinable`."""
+        return self._raising.joinable()
 
     @property
     def visiting(self) -> frozenset[str]:

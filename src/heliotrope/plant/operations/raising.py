@@ -181,17 +181,17 @@ class Raising:
             found |= plant.guards.reasons(self._asked(command, np.flatnonzero(there)))
         return found
 
-    def uncalibrated(self, heliostats: Sequence[str]) -> tuple[str, ...]:
-        """Return the heliostats that must be calibrated before they may go to the receiver."""
-        beliefs, place = self._plant.beliefs, self._plant.field.place
-        return tuple(
-            name
-            for name in heliostats
-            if not self._clear[place(name)] and beliefs.record(name) is None
-        )
+    def joinable(self) -> Mask:
+        """Return a mask of the heliostats that may go to the receiver when they have an aim, (N,).
+
+        They are known well enough, and their beams have a free path.
+        """
+        calibrated = [self._plant.beliefs.record(name) is not None for name in self._names]
+        free = [name not in self._blocked for name in self._names]
+        return np.asarray((self._clear | np.array(calibrated, dtype=np.bool_)) & free)
 
     def _known(self) -> Mask:
-        """Return a mask of the heliostats known well enough to go to the receiver, (N,)."""
+        """Return a mask of the heliostats known well enough to go to their aims, (N,)."""
         calibrated = [self._plant.beliefs.record(name) is not None for name in self._names]
         aimed = [name in self.aims for name in self._names]
         known: Mask = (self._clear | np.array(calibrated, dtype=np.bool_)) & aimed
