@@ -16,7 +16,7 @@ from heliotrope.airborne.evaluate.orientation import (
 )
 from heliotrope.airborne.evaluate.reflections import Reflections, join, reflections
 from heliotrope.airborne.evaluate.sightings import to_sightings
-from heliotrope.airborne.mirror import MirrorShape, measured_normal, orientation, reflection_points
+from heliotrope.airborne.mirror import MirrorShape, measured_normal, reflection_points
 from heliotrope.airborne.simulate.trial import (
     TrialConditions,
     Trials,
@@ -28,6 +28,7 @@ from heliotrope.calibration import sightings as kinds
 from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.errors import InputError
+from heliotrope.field.formats.frames import orientation
 from heliotrope.geometry import MRAD, direction, normalize, reflect, tangent_axes
 from heliotrope.mechanism.kinds import azimuth_elevation
 
@@ -225,7 +226,7 @@ def test_the_papers_systematic_budget() -> None:
     s = trial_mirror(SHAPE, EXACT, 1)
     found = measure(s.reflections, SHAPE, s.expected_rotation, s.expected_vertex, budget=budget)
     np.testing.assert_allclose(found.systematic, budget.systematic(150.0), rtol=1e-3)
-    with pytest.raises(InputError, match="rtk -1"):
+    with pytest.raises(InputError, match="rtk must be 0 or more, not -1"):
         Budget(rtk=-1.0)
     with pytest.raises(InputError, match="lamp nan"):
         Budget(lamp=float("nan"))

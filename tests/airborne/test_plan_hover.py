@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from heliotrope.airborne.mirror import ideal, orientation, reflection_points
+from heliotrope.airborne.mirror import ideal, reflection_points
 from heliotrope.airborne.plan.airspace import Airspace
 from heliotrope.airborne.plan.calibration_points import (
     CalibrationPoints,
@@ -24,6 +24,7 @@ from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.sightings import drone
 from heliotrope.calibration.uncertainty import precision, suns_of_year
 from heliotrope.errors import InputError
+from heliotrope.field.formats.frames import orientation
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import (
     MRAD,
@@ -319,10 +320,10 @@ def test_sampling_refuses(change: dict[str, float], text: str) -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"points": 0}, "0 calibration points"),
-        ({"sigma": 0.0}, "sigma 0.0 rad"),
+        ({"points": 0}, "calibration points must be .* not 0"),
+        ({"sigma": 0.0}, "sigma of a normal must be .* not 0.0 rad"),
         ({"min_elevation": 1.5, "max_elevation": 1.0}, "the lower first"),
-        ({"share": 0.0}, "share 0.0"),
+        ({"share": 0.0}, "share must be .* not 0.0"),
     ],
 )
 def test_choosing_refuses(change: dict[str, float], text: str) -> None:

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from heliotrope.airborne.evaluate.sightings import fit_together
-from heliotrope.airborne.mirror import orientation
 from heliotrope.calibration import sightings as kinds
 from heliotrope.calibration.fit.common import derivative_by_turn, turned_back
 from heliotrope.calibration.fit.estimator import FieldFit, fit
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.errors import InputError
+from heliotrope.field.formats.frames import orientation
 from heliotrope.geometry import MRAD, direction, normalize, reflect
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.kinds import azimuth_elevation

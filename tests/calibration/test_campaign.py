@@ -213,7 +213,7 @@ def test_campaign_refusals() -> None:
         Timing(settle=-1.0)
     with pytest.raises(InputError, match="too short"):
         Timing(0.0, 0.0, 0.0)
-    with pytest.raises(InputError, match="information of shape"):
+    with pytest.raises(InputError, match="information has the shape"):
         Fleet(FIELD, NAMES, fleet.information, fleet.form, AIM)
     with pytest.raises(InputError, match="one axis"):
         Fleet(FIELD[0], NAMES, fleet.information, fleet.form, AIM)

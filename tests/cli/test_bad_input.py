@@ -127,7 +127,7 @@ REPLACED: list[tuple[str, str, str, str, str]] = [
      "'roll' is not a driven joint"),
     ("unknown drive", "toml", 'kind = "rotary"', 'kind = "hydraulic"', "hydraulic"),
     ("an angle twice", "toml", "min_angle_deg = -180", "min_angle_deg = -180\nmin_angle_rad = -3",
-     "min_angle is given in deg and rad"),
+     "min_angle is specified in deg and rad"),
     ("target without size", "toml", "width_m = 3\n", "", "specify corners_m, or center_m"),
     ("target of no area", "toml", "center_m = [0, 0, 13]",
      "corners_m = [[0,0,0],[1,0,0],[2,0,0],[3,0,0]]\ncenter_m = [0, 0, 13]", "span no area"),
@@ -395,7 +395,7 @@ ARGUMENTS: list[tuple[list[str], str]] = [
     (["calibrate", "PAINT", "--model", "malan9"], "malan9"),
     (
         ["calibrate", "PAINT", "--fraction", "1.5"],
-        "--fraction must be a number from 0.01 to 1 ",
+        "--fraction must be a number from 0.01 to 1, ",
     ),
     (["fetch", "almeria", "AA39", "--into", "EMPTY"], "there is no data set 'almeria'"),
     (["fetch", "juelich", "../AA39", "--into", "EMPTY"], "use a name of letters and digits"),

@@ -295,7 +295,10 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
         ((*TEACH, *points(), "--size", "big"), "'big' is not a number of metres"),
         ((*TEACH, *points(), "--size", "0"), "size must be above 0, not 0.0 m"),
         ((*TEACH, *points(), "--size", "1", "--size", "2"), "'2': specified twice"),
-        ((*TEACH, *points(), "--size", "dot=1", "--size", "dot=2"), "given twice for point dot"),
+        (
+            (*TEACH, *points(), "--size", "dot=1", "--size", "dot=2"),
+            "specified twice for point dot",
+        ),
         (
             (*TEACH, *points(), "--sigma-px", "0"),
             "--sigma-px must be a number from 0.001 to 1,000",

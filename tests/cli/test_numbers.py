@@ -272,7 +272,10 @@ def test_every_number_ends_in_a_value_or_in_one_line(
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        (("sun", "--height", "0,5"), "a number from -500 to 9,000 with a point, not a comma (He"),
+        (
+            ("sun", "--height", "0,5"),
+            "a number from -500 to 9,000 with a decimal point, without a comma, not '0,5' (He",
+        ),
         (
             ("sun", "--height", "5 m"),
             "--height must be a number from -500 to 9,000, not '5 m' (Height",

@@ -147,7 +147,9 @@ def test_of_many_commands_at_once_each_is_done_or_refused(tmp_path: Path) -> Non
 def test_a_third_key_is_refused_and_so_is_an_end_without_a_new_one(tmp_path: Path) -> None:
     path = private(tmp_path / "keys", f'[clusters]\nK1 = "{OLD.hex()}"\n')
     file = KeyFile(path)
-    with pytest.raises(InputError, match="K1 has an old key beside a new one; nothing to end"):
+    with pytest.raises(
+        InputError, match="K1 has an old key beside a new one; there is nothing to end"
+    ):
         file.end(["K1"])
     (new,) = file.rotate(["K1"]).values()
     with pytest.raises(InputError, match="K1 already has two keys; run heliotrope keys end"):

@@ -79,10 +79,10 @@ def test_pauses_double_to_their_limit_and_begin_anew() -> None:
     [
         ({"period": 1.0, "deadline": 1.5}, "must be at least twice the period"),
         ({"first_pause": 3.0}, "at most the longest"),
-        ({"capacity": 0}, "capacity 0"),
-        ({"largest": 0}, "largest message 0 bytes"),
-        ({"horizon": 0.0}, "horizon 0.0 s"),
-        ({"horizon": 9000.0}, "horizon 9000.0 s"),
+        ({"capacity": 0}, "capacity must be at least 1, .* not 0,"),
+        ({"largest": 0}, "largest message at least 1 byte .* 0 bytes"),
+        ({"horizon": 0.0}, "horizon 0 to 4000 s, .* 0.0 s"),
+        ({"horizon": 9000.0}, "horizon 0 to 4000 s, .* 9000.0 s"),
     ],
 )
 def test_settings_that_contradict_each_other_are_refused(

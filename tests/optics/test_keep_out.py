@@ -485,10 +485,13 @@ def test_what_cannot_be_is_refused() -> None:
         ),
         (lambda: Prism("d", ((0, 0), (0, 0), (1, 1)), 0, 1), "two neighbouring corners coincide"),
         (lambda: MirrorOptics.of(0.0, 1.0), "mirrors: width must be above 0 and finite, not 0.0 m"),
-        (lambda: MirrorOptics.of(1.0, 1.0, reflectivity=1.5), "reflectivity 1.5 .* at most 1"),
+        (
+            lambda: MirrorOptics.of(1.0, 1.0, reflectivity=1.5),
+            "reflectivity must be .* at most 1, not 1.5",
+        ),
         (lambda: MirrorOptics.of(1.0, 1.0, focus=-3.0), "a focus must be above 0 m"),
         (lambda: MirrorOptics.of(1.0, 1.0, error=0.6), "an error must be between 0 and 0.5 rad"),
-        (lambda: MirrorOptics.of(np.ones((2, 2)), 1.0), "give numbers or"),
+        (lambda: MirrorOptics.of(np.ones((2, 2)), 1.0), "expected numbers or"),
         (lambda: MirrorOptics.of([1.0, 1.0], 1.0).broadcast(3), "mirrors: got 2 for 3 beams"),
         (
             lambda: optics.beams((0, 0, 0), (0, 0, 0), MirrorOptics.of(1, 1)),

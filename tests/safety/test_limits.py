@@ -86,7 +86,7 @@ def test_rows_of_leases_and_of_orders_cannot_be_set() -> None:
         (
             {"wind_gust_stow": {"trips_m_s": 14.0}},
             (
-                "wind_gust_stow: it releases at 15 m/s, which must be below its trip at 14 m/s; "
+                "wind_gust_stow: the release at 15 m/s must be below the trip at 14 m/s; "
                 "set trips and releases together"
             ),
         ),
@@ -121,7 +121,7 @@ def test_rows_of_leases_and_of_orders_cannot_be_set() -> None:
         ),
         (
             {"pointing_disagrees": {"trips_deg": 0.2, "trips_mrad": 3.0}},
-            "pointing_disagrees.trips_mrad: trips is given twice",
+            "pointing_disagrees.trips_mrad: trips is specified twice",
         ),
         (
             {"keep_out_predicted": {"then_stow_s": 31.0}},

@@ -405,7 +405,7 @@ def test_autonomy_moves_the_plant_link_only() -> None:
     assert changed == ["plant_link_lost"]
     assert other["plant_link_lost"].trips == 123.0
     for wrong in (-1.0, math.nan):
-        with pytest.raises(InputError, match=r"autonomy .* must be finite"):
+        with pytest.raises(InputError, match=r"autonomy must be finite"):
             safety.conditions(wrong)
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.mirror import orientation
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.formats.frames import orientation
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.files.cells import read_rows
 from heliotrope.files.text import write_text

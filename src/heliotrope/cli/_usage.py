@@ -29,7 +29,7 @@ def _number(error: TyperException) -> str | None:
     value = getattr(cause, "errors", list)()[0]["input"]
     name = error.param.opts[0] if error.param.param_type_name == "option" else error.param.name
     kind = "a whole number" if "int" in str(error.param.type_descriptor.annotation) else "a number"
-    comma = " with a point, not a comma" if "," in str(value) else ""
+    comma = " with a decimal point, without a comma" if "," in str(value) else ""
     limits = " to ".join(
         f"{end:,}" if isinstance(end, int) else f"{end:,.10g}" for end in (low, high)
     )

@@ -177,25 +177,34 @@ class Raising:
                 if plant.design.aims.limit is not None:
                     found |= {name: _NO_AIM for name in at_standby if name not in self.aims}
                 found |= dict.fromkeys(self.uncalibrated(at_standby), _UNCALIBRATED)
-                there &= self._known()
+                there &= self._known() & self._aimed()
             found |= plant.guards.reasons(self._asked(command, np.flatnonzero(there)))
         return found
+
+    def uncalibrated(self, heliostats: Sequence[str]) -> tuple[str, ...]:
+        """Return the heliostats that must be calibrated before they may go to the receiver."""
+        known, place = self._known(), self._plant.field.place
+        return tuple(name for name in heliostats if not known[place(name)])
 
     def joinable(self) -> Mask:
         """Return a mask of the heliostats that may go to the receiver when they have an aim, (N,).
 
         They are known well enough, and their beams have a free path.
         """
-        calibrated = [self._plant.beliefs.record(name) is not None for name in self._names]
         free = [name not in self._blocked for name in self._names]
-        return np.asarray((self._clear | np.array(calibrated, dtype=np.bool_)) & free)
+        return np.asarray(self._known() & free)
 
     def _known(self) -> Mask:
-        """Return a mask of the heliostats known well enough to go to their aims, (N,)."""
+        """Return a mask of the heliostats whose beams are known well enough for the receiver, (N,).
+
+        They are calibrated, or their beams would miss all targets by a wide margin.
+        """
         calibrated = [self._plant.beliefs.record(name) is not None for name in self._names]
-        aimed = [name in self.aims for name in self._names]
-        known: Mask = (self._clear | np.array(calibrated, dtype=np.bool_)) & aimed
-        return known
+        return np.asarray(self._clear | np.array(calibrated, dtype=np.bool_))
+
+    def _aimed(self) -> Mask:
+        """Return a mask of the heliostats that have an aim, (N,)."""
+        return np.array([name in self.aims for name in self._names], dtype=np.bool_)
 
     def _asked(self, command: str, rows: Rows) -> Asked:
         """Return a command to heliostats (K,) in the form that guards check.
@@ -318,7 +327,7 @@ class Raising:
             if len(rows := self._first(name, rows)):
                 give = functools.partial(plant.command, self._person, token, name)
                 self._give(rows, state, give)
-        able = free & self._known() & plant.field.among((states.IDLE,), now)
+        able = free & self._known() & self._aimed() & plant.field.among((states.IDLE,), now)
         rows = self._first("TRACK", np.flatnonzero(able))
         if len(rows) and plant.waiting < self._most:
             await self._join(rows, token, visiting)
