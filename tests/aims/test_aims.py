@@ -280,7 +280,11 @@ def test_maps_are_resampled_to_the_least_and_files_are_read_from_the_top(tmp_pat
     assert FluxLimit(np.array([[1.0], [2.0], [3.0]])).on(2, 1).tolist() == [[1.0], [2.0]]
     (tmp_path / "limit.csv").write_text("3e5,4e5,\n1e5,2e5,\n")
     assert read_limit(tmp_path / "limit.csv").on(2, 2).tolist() == [[1e5, 2e5], [3e5, 4e5]]
-    for text, match in (("a,b\n", "line 1"), ("1,2\n3\n", "line 2: 1 numbers"), ("", "empty")):
+    for text, match in (
+        ("a,b\n", "line 1"),
+        ("1,2\n3\n", "line 2: this row has 1 numbers"),
+        ("", "empty"),
+    ):
         (tmp_path / "limit.csv").write_text(text)
         with pytest.raises(FormatError, match=match):
             read_limit(tmp_path / "limit.csv")

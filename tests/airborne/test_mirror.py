@@ -12,13 +12,13 @@ from heliotrope.airborne.mirror import (
     MirrorShape,
     ideal,
     measured_normal,
-    orientation,
     rectangle,
     reflection_points,
     tiled,
 )
 from heliotrope.airborne.slopes import smooth_slopes
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.formats.frames import orientation
 from heliotrope.field.formats.slopes import read_slopes, write_slopes
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.geometry import MRAD, angle_between, normalize, rotation

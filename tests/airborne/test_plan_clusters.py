@@ -59,7 +59,7 @@ def test_every_heliostat_is_in_one_cluster(seed: int, count: int, size: float) -
 def test_refusals() -> None:
     with pytest.raises(InputError, match="there is no heliostat"):
         clusters(np.empty((0, 3)))
-    with pytest.raises(InputError, match="cluster size 0 m: must be a length above 0"):
+    with pytest.raises(InputError, match="cluster size must be a length above 0, not 0 m"):
         clusters(radial(10), size=0.0)
     with pytest.raises(InputError, match="most heliostats have the same position"):
         clusters(np.zeros((5, 3)))

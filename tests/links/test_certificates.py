@@ -108,7 +108,7 @@ def test_keys_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         certify(tmp_path, NAMES, NOW)
     (tmp_path / "ca.key").write_bytes((tmp_path / "console.key").read_bytes())
     (tmp_path / "ca.key").chmod(0o600)
-    with pytest.raises(FormatError, match=r"ca\.pem: it does not belong to ca\.key"):
+    with pytest.raises(FormatError, match=r"ca\.pem: this certificate does not belong to ca\.key"):
         certify(tmp_path, NAMES, NOW)
 
 

@@ -18,9 +18,9 @@ from heliotrope.field.layouts import malan_plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import MRAD, direction
 from heliotrope.lcu import states
+from heliotrope.optics.shading import nearest
 from heliotrope.plant.schedule import scheduler as schedule
 from heliotrope.plant.schedule.choice import Sight, hidden
-from heliotrope.plant.schedule.knowledge import neighbours
 from heliotrope.plant.schedule.scheduler import (
     Assignment,
     Finished,
@@ -177,8 +177,8 @@ def test_a_neighbour_hides_what_it_overlaps_from_however_near_in_front() -> None
 
 
 def test_a_mirror_alone_is_hidden_by_nobody() -> None:
-    assert neighbours(np.zeros((1, 3))).tolist() == [[]]
-    assert neighbours(np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])).tolist() == [[1], [0]]
+    assert nearest(np.zeros((1, 3))).tolist() == [[]]
+    assert nearest(np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])).tolist() == [[1], [0]]
 
 
 def test_far_drives_are_a_cost() -> None:
