@@ -209,7 +209,7 @@ def test_a_fit_without_names_goes_by_rows() -> None:
     assert moved["P6A"].deviations["tilt_north"] == 1e-3 * plant.names.index("P6A")
     alike = plant.groups["azel"].with_calibration(_Values({"canting": np.array(2e-3)}))
     assert alike.deviations["canting"].tolist() == [2e-3] * 18
-    with pytest.raises(InputError, match="18 heliostats without names: there are 1;"):
+    with pytest.raises(InputError, match="18 heliostats without names, but there are 1;"):
         plant["P6A"].with_calibration(found)
 
 

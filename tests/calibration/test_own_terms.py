@@ -126,7 +126,10 @@ def test_one_heliostat_of_a_plant_goes_by_its_name() -> None:
     [
         ([], "the list is empty"),
         ([ECCENTRIC, ECCENTRIC], "term eccentric: the name occurs twice"),
-        ([DriveTerm("x", "azimuth", lambda a: a[..., 0], 0.0)], "term x: prior 0.0"),
+        (
+            [DriveTerm("x", "azimuth", lambda a: a[..., 0], 0.0)],
+            r"term x: prior must be .* not 0.0",
+        ),
         ([DriveTerm("x", "azimuth", lambda a: a, 1e-3)], r"term x: its function returned shape \("),
         ([DriveTerm("x", "azimuth", lambda a: a[..., 0] * np.nan, 1e-3)], "one finite number"),
         ([DriveTerm("x", "azimuth", lambda a: "much", 1e-3)], "one finite number"),

@@ -114,7 +114,7 @@ def test_a_day_and_a_year_are_tables(flux: Any, tmp_path: Path) -> None:
         ((SUN, "--facets=5x7", "--canting=noon"), "time 'noon' is not ISO 8601"),
         ((SUN, "--cells=0x4"), "--cells '0x4': write ROWSxCOLUMNS, such as 20x56"),
         ((SUN, "--tower=1,2,3"), "--tower '1,2,3': write four numbers in m"),
-        ((SUN, "--tower=0,-24,30,9"), "stands inside a tower of radius 30.0 m; move it"),
+        ((SUN, "--tower=0,-24,30,9"), "of a tower of radius 30 m, inside it; correct either"),
         ((SUN, "--receiver=none"), "receiver 'none'"),
         ((SUN, "--rays=10"), "rays must be between 1,000 and 1,000,000,000, not 10"),
         ((SUN, "--sam=s.csv"), "--sam: this file is written only for --year"),
@@ -140,7 +140,7 @@ def test_bad_input_ends_in_one_line(flux: Any, words: tuple[str, ...], line: str
         ("[groups.azel.mirror]\nslope_maps = 'maps'\n", (), "no such folder"),
         ("[groups.azel.mirror]\ncanting = 'slant'\n", (), "add facets = [columns, rows]"),
         ("[[towers]]\neast_m = 0\nnorth_m = 0\nradius_m = 900\ntop_m = 9\n", (), "of a tower of"),
-        ("", ("--tower=0,0,900,9",), "inside a tower of radius 900"),
+        ("", ("--tower=0,0,900,9",), "of a tower of radius 900 m, inside it"),
         ("", ("--dni=-1",), "--dni"),
     ],
 )

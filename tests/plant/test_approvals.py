@@ -3,6 +3,7 @@
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,6 +38,9 @@ class Kept:
         self.versions: list[HeliostatCalibration] = []
         self.document = ""
         self.told: list[tuple[str, str]] = []
+
+    async def read(self, query: Callable[["Kept"], Any]) -> Any:
+        return query(self)
 
     def calibration_history(self, heliostat: str) -> list[HeliostatCalibration]:
         return [one for one in self.versions if one.heliostat == heliostat]
