@@ -171,7 +171,7 @@ MECHANISMS = [
     Wrong(lambda: two(leans=("west", "north")), "lean", "'west'", "east", UnknownNameError),
     Wrong(lambda: two(orientation=2.0 * np.eye(3)), "orientation", "deviates by 3", "1e-9"),
     Wrong(lambda: two(orientation=30.0), "orientation", "()", "(..., 3, 3)"),
-    Wrong(lambda: two(drives=(direct(),)), "drives", "1 given", "has 2"),
+    Wrong(lambda: two(drives=(direct(),)), "drives", "got 1, but", "has 2"),
     Wrong(lambda: two(drives=(direct(), 40.0)), "drives", "float", "2 drives"),
     Wrong(lambda: kinds.two_axis(ORIGIN, UP, UP, NORTH), "axes", "0 mrad", "parallel"),
     Wrong(lambda: kinds.two_axis(ORIGIN, UP, NORTH, NORTH), "normal", "parallel to the secondary axis", "not change"),
