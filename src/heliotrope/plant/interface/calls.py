@@ -19,6 +19,7 @@ from pydantic import BaseModel
 
 from heliotrope.calibration.flights import FlightDocument, parse_flight
 from heliotrope.errors import InputError
+from heliotrope.field.formats.plant_help import HelpTable, plant_help
 from heliotrope.field.timetable import TimetableEntry
 from heliotrope.plant.attempts import Retry
 from heliotrope.plant.interface import orders
@@ -706,6 +707,13 @@ async def plant_file(desk: Desk, who: Person) -> PlantFileView:
     restarts; `waiting`: a text that waits for the approval of a second engineer.
     """
     return await desk.operations.plant_file.view(who)
+
+
+@_call("GET plant-file/help", "plant file", ENGINEER, fresh=ALWAYS)
+def plant_file_help(desk: Desk) -> tuple[HelpTable, ...]:
+    """Return the keys of each table of a plant file, with their kind, limits and meaning."""
+    del desk
+    return plant_help()
 
 
 @_call("GET plant-file/versions/{name}", "plant file", ENGINEER)
