@@ -79,6 +79,10 @@ NEEDED = {
     ("GET", "trends"): "viewer",
     ("GET", "trend"): "viewer",
     ("POST", "notes"): "operator",
+    **{(method, f"plant-file{path}"): "engineer" for method, path in (
+        ("GET", ""), ("PUT", ""), ("GET", "/help"), ("GET", "/versions/{name}"),
+        ("POST", "/check"), ("POST", "/waiting/{number}/approve"),
+        ("POST", "/waiting/{number}/refuse"), ("DELETE", "/waiting/{number}"))},
     ("GET", "accounts"): "engineer",
     ("POST", "accounts"): "engineer",
     ("PATCH", "accounts/{name}"): "engineer",
