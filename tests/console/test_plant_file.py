@@ -162,6 +162,13 @@ def test_ctl_prints_checks_and_stores(console: LiveConsole, ctl: Ctl, tmp_path: 
     ctl("engineer", *words)
 
 
+def paste(page: Any, text: str) -> None:
+    """Replace the text in the editor; `fill` would insert each of its lines by itself."""
+    page.locator("dialog .hx-toml").evaluate(
+        "(box, text) => { box.value = text; box.dispatchEvent(new Event('input')); }", text
+    )
+
+
 @NEEDS_BROWSER
 @pytest.mark.parametrize("width", [1440, 820])
 def test_a_camera_is_changed_on_the_page(
@@ -184,7 +191,7 @@ def test_a_camera_is_changed_on_the_page(
         page.wait_for_selector("dialog .hx-keys-of dt.now:has-text('focal_px required')")
         # A wrong value is told in one line, at its line, and nothing typed is lost.
         wrong = re.sub(r"deviation_px = .*", "deviation_px = -1.0", text, count=1)
-        editor.fill(wrong)
+        paste(page, wrong)
         page.fill("dialog [name=reason]", "surveyed")
         page.click("dialog >> text='Store'")
         page.wait_for_selector("dialog .hx-found .bad:has-text('deviation_px: -1.0: input should')")
@@ -203,7 +210,7 @@ def test_a_camera_is_changed_on_the_page(
         page.wait_for_selector("dialog .hx-told:has-text('typed before')")
         assert editor.input_value() == wrong
         assert page.input_value("dialog [name=reason]") == "surveyed"
-        editor.fill(camera_moved(text, 0.5))
+        paste(page, camera_moved(text, 0.5))
         page.click("dialog >> text='Check'")
         page.wait_for_selector("dialog .hx-told:has-text('Used at once when stored')")
         assert name in page.inner_text("dialog .hx-told")
@@ -240,12 +247,12 @@ def test_a_moved_receiver_waits_for_the_restart(
     text = file.read_text()
     page = enter("engineer", viewport={"width": 820, "height": 1180}, has_touch=True)
     page.tap("text=Plant file…")
-    page.fill("dialog .hx-toml", rounded(text, "7.5"))
+    paste(page, rounded(text, "7.5"))
     page.fill("dialog [name=reason]", "panel")
     page.tap("dialog >> text='Store'")
     page.wait_for_selector("dialog .hx-pending:has-text('when the plant restarts: receivers')")
     assert read_plant(file).receivers[0].radius == 7.5
-    page.fill("dialog .hx-toml", text)
+    paste(page, text)
     page.fill("dialog [name=reason]", "back")
     page.tap("dialog >> text='Store'")
     page.wait_for_selector("dialog .hx-pending", state="detached")
@@ -273,7 +280,7 @@ def test_two_engineers_on_the_page(tmp_path: Path, browser: Any) -> None:
         text = (tmp_path / "plant.toml").read_text()
         first = enter("engineer")
         first.click("text=Plant file…")
-        first.fill("dialog .hx-toml", rounded(text, "7.5"))
+        paste(first, rounded(text, "7.5"))
         first.fill("dialog [name=reason]", "panel")
         first.click("dialog >> text='Ask for a second engineer'")
         first.wait_for_selector("dialog .hx-waiting >> text=Withdraw")

@@ -30,12 +30,14 @@ export async function editPlantFile() {
   const said = h("p", { className: "hx-told", role: "status" }), found = h("ul", { className: "hx-list hx-found" }), result = h("div"), state = h("div"), keys = h("aside", { className: "hx-keys-of" });
   const reason = h("input", { name: "reason", maxLength: 500, placeholder: t("Reason, kept with the version"), ariaLabel: t("Reason") });
   const tell = (words, bad) => { said.textContent = words; said.classList.toggle("bad", Boolean(bad)); };
-  let based = view.version, wrong = new Map(), busy = false, helped = "";
+  let based = view.version, wrong = new Map(), busy = false, helped = "", numbered = "";
   const button = (title, go, kind = "") => h("button", { type: "button", className: `hx-button ${kind}`, onclick: go }, title);
   const typed = () => text.value !== view.text;
 
   const number = () => {
-    const lines = text.value.split("\n").length;
+    const lines = text.value.split("\n").length, now = [lines, ...wrong.keys()].join();
+    if (now === numbered) return;
+    numbered = now;
     gutter.replaceChildren(...Array.from({ length: lines }, (_, i) => h("span", { className: wrong.get(i + 1)?.severity === "error" ? "bad" : wrong.has(i + 1) ? "warn" : "", title: wrong.get(i + 1)?.text ?? "" }, `${i + 1}\n`)));
     gutter.scrollTop = text.scrollTop;
   };
@@ -56,7 +58,7 @@ export async function editPlantFile() {
     explain();
   };
   const changed = () => { draft = typed() || reason.value ? { text: text.value, based, reason: reason.value } : null; };
-  const put = (value, version) => { text.value = value; based = version; wrong = new Map(); helped = ""; found.replaceChildren(); result.replaceChildren(); number(); explain(); changed(); };
+  const put = (value, version) => { text.value = value; text.setSelectionRange(0, 0); based = version; wrong = new Map(); helped = ""; found.replaceChildren(); result.replaceChildren(); number(); explain(); changed(); };
   text.oninput = () => { if (wrong.size) { wrong = new Map(); found.replaceChildren(); } result.replaceChildren(); number(); explain(); changed(); };
   text.onscroll = () => { gutter.scrollTop = text.scrollTop; };
   text.onclick = text.onkeyup = explain;

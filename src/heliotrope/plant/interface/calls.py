@@ -709,7 +709,7 @@ async def plant_file(desk: Desk, who: Person) -> PlantFileView:
     return await desk.operations.plant_file.view(who)
 
 
-@_call("GET plant-file/help", "plant file", ENGINEER, fresh=ALWAYS)
+@_call("GET plant-file/help", "plant file", fresh=ALWAYS)
 def plant_file_help(desk: Desk) -> tuple[HelpTable, ...]:
     """Return the keys of each table of a plant file, with their kind, limits and meaning."""
     del desk
