@@ -94,8 +94,12 @@ def _kind(schema: Mapping[str, Any], known: Mapping[str, Any]) -> str:
 
 def _limits(schema: Mapping[str, Any]) -> str:
     signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
-    said = [f"{sign} {schema[key]:g}" for key, sign in signs.items() if key in schema]
+    said = [f"{sign} {_number(schema[key])}" for key, sign in signs.items() if key in schema]
     return f" {', '.join(said)}" if said else ""
+
+
+def _number(value: float) -> str:
+    return f"{value:,}" if isinstance(value, int) else f"{value:g}"
 
 
 def _text(schema: Mapping[str, Any]) -> str:
