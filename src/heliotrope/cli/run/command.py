@@ -377,10 +377,9 @@ def run(
             evidence=Evidence(syslog, syslog_authority, heads, heads_every),
             photographs=PictureSettings(*_kept(photographs_days, photographs_gb)),
         )
-        own = field if field is not None and field.suffix == ".toml" else None
         if twin is not None:
             twin.wait()
-            choice = PlantChoice(twin.folder, twin.folder / LINKS, bool(idle), aimed=up, file=own)
+            choice = PlantChoice(twin.folder, twin.folder / LINKS, bool(idle), aimed=up, file=field)
             run_plant(open_plant(twin.folder / PLANT), choice, shown, twin.begin)
             return
         assert clusters is not None
@@ -388,7 +387,7 @@ def run(
             raise InputError("run: --clusters needs a plant file; name it before the options")
         _only_real(speed=speed != 1.0, start=start != "morning", seed=bool(seed))
         folder = field if field.is_dir() else field.parent
-        choice = PlantChoice(folder, clusters, idle is not False, configure, check, file=own)
+        choice = PlantChoice(folder, clusters, idle is not False, configure, check, file=field)
         run_plant(open_plant(field), choice, shown)
 
 

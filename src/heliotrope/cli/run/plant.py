@@ -69,7 +69,7 @@ Prepare = Callable[[Keeper, Plant, datetime], Awaitable[None]]
 class PlantChoice:
     """Options of a plant on the command line; see `cli.run.command`.
 
-    ``file`` is the plant's own file, if it was started with one. ``aimed`` means that the
+    ``file`` is the file or folder with which the plant was started, if any. ``aimed`` means that the
     heliostats of a simulated field track the design's aims when the plant starts.
     """
 
@@ -80,6 +80,11 @@ class PlantChoice:
     check: bool = False
     aimed: bool = False
     file: Path | None = None
+
+    @property
+    def plant_file(self) -> Path | None:
+        """The plant's file, if it is in our own format."""
+        return self.file if self.file is not None and self.file.suffix == ".toml" else None
 
 
 def run_plant(
@@ -340,7 +345,7 @@ async def _run(
             await prepare(keeper, design, outside.clock.utc())
         ports = outside.ports(design, choice, shown, keeper, worker)
         kept = pictures(shown, folder, waits=outside.fast)
-        ports = replace(ports, pictures=kept, marks=shown.marks, file=choice.file)
+        ports = replace(ports, pictures=kept, marks=shown.marks, file=choice.plant_file)
         live = PlantAssembly(design, ports, _settings(design, choice, shown, outside))
         if choice.aimed:
             live.aim_as_designed()
