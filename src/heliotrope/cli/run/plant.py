@@ -69,7 +69,7 @@ Prepare = Callable[[Keeper, Plant, datetime], Awaitable[None]]
 class PlantChoice:
     """Options of a plant on the command line; see `cli.run.command`.
 
-    ``file`` is the file or folder with which the plant was started, if any. ``aimed`` means that the
+    ``file`` is the file or folder with which the plant was started. ``aimed`` means that the
     heliostats of a simulated field track the design's aims when the plant starts.
     """
 
