@@ -98,6 +98,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "ctl approvals": (),
     "ctl calibrate": ("A1",),
     "ctl parameters": ("A1",),
+    "ctl plant-file": (),
     "ctl photographs": ("A1",),
     "ctl reading": ("wind",),
     "ctl out-of-service": ("--reason", "x", "A1"),

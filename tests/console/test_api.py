@@ -79,6 +79,11 @@ NEEDED = {
     ("GET", "trends"): "viewer",
     ("GET", "trend"): "viewer",
     ("POST", "notes"): "operator",
+    **{(method, f"plant-file{path}"): "engineer" for method, path in (
+        ("GET", ""), ("PUT", ""), ("GET", "/versions/{name}"),
+        ("POST", "/check"), ("POST", "/waiting/{number}/approve"),
+        ("POST", "/waiting/{number}/refuse"), ("DELETE", "/waiting/{number}"))},
+    ("GET", "plant-file/help"): "viewer",
     ("GET", "accounts"): "engineer",
     ("POST", "accounts"): "engineer",
     ("PATCH", "accounts/{name}"): "engineer",

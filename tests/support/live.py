@@ -87,6 +87,7 @@ class LivePlant:
         extra: Callable[[], Mapping[str, Any]] = dict,
         pictures: Pictures | None = None,
         marks: Path | None = None,
+        file: Path | None = None,
         learner: Learner | None = None,
         stored: Plant | None = None,
     ) -> None:
@@ -100,7 +101,7 @@ class LivePlant:
         ports = self.world.ports(
             audit=audit, disk=disk, records=records, assigned=assigned, facts=extra
         )
-        ports = replace(ports, pictures=pictures, marks=marks, learner=learner)
+        ports = replace(ports, pictures=pictures, marks=marks, file=file, learner=learner)
         self.assembly = PlantAssembly(design, ports, chosen.settings())
         self.plant, self.operations = self.assembly.plant, self.assembly.operations
         self.names, self.cameras, self.field = (

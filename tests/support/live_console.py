@@ -22,6 +22,7 @@ from heliotrope.console.serve import ConsoleServer
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.console.urgent_process import server_of, way_of
 from heliotrope.field.approval import ApprovalSettings
+from heliotrope.field.formats.plant_file import write_plant
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.volumes import Box
 from heliotrope.links.clock import VirtualClock
@@ -95,6 +96,7 @@ class LiveConsole:
         child: Patience | None = None,
         settings: ConsoleSettings | None = None,
         marks: Path | None = None,
+        file: Path | None = None,
         work: AutomaticSettings | None = None,
         given: frozenset[str] = frozenset(),
         together: bool = False,
@@ -106,7 +108,7 @@ class LiveConsole:
         self._pictures = None if pictures is None else Pictures(pictures)
         self._made, self._child = (heliostats, speed), child
         self._settings = settings or ConsoleSettings(port=0)
-        self._marks = marks
+        self._marks, self._file = marks, file
         self._options = LiveOptions(
             rendered=rendered,
             boards=boards,
@@ -140,6 +142,8 @@ class LiveConsole:
         for role in ROLES:
             self.keeper.people.add(role, _secrets.hash_password(PASSWORD), role, now)
         design = replace(malan_plant(heliostats), keep_outs=(GATE,), approval=self._approval)
+        if self._file is not None:
+            write_plant(design, self._file)
         self.live = LivePlant(
             design,
             clock,
@@ -148,6 +152,7 @@ class LiveConsole:
             records=self.keeper,
             extra=lambda: {"speed": speed},
             marks=self._marks,
+            file=self._file,
             pictures=self._pictures,
         )
         self.interface = PlantInterface(self.live.operations, self.keeper.people, self.folder)

@@ -862,6 +862,124 @@ def _show_waiting(waiting: list[dict[str, Any]], as_json: bool = False) -> None:
         print("no changes are waiting for approval")
 
 
+@app.command("plant-file")
+def plant_file(
+    context: typer.Context,
+    check: Annotated[
+        Path | None,
+        typer.Option("--check", help="File whose text is checked.", show_default=False),
+    ] = None,
+    store: Annotated[
+        Path | None,
+        typer.Option(
+            "--store", help="File whose text replaces the plant file.", show_default=False
+        ),
+    ] = None,
+    versions: Annotated[bool, typer.Option("--versions", help="List the stored versions.")] = False,
+    version: Annotated[str, typer.Option(help="Print this stored version.")] = "",
+    waiting: Annotated[
+        bool, typer.Option("--waiting", help="Show the text that waits for a second engineer.")
+    ] = False,
+    approve: Annotated[
+        int, typer.Option(min=0, max=2**53, help="Approve the waiting text of this number.")
+    ] = 0,
+    refuse: Annotated[int, typer.Option(min=0, max=2**53, help="Refuse it; needs --reason.")] = 0,
+    withdraw: Annotated[int, typer.Option(min=0, max=2**53, help="Withdraw your own.")] = 0,
+    reason: Annotated[str, typer.Option(help="Reason, recorded with a new text.")] = "",
+    replaces: Annotated[
+        str, typer.Option(help="Version of the text that was changed; default: the present one.")
+    ] = "",
+    as_json: Json = False,
+) -> None:
+    """Print the plant file as the running plant has it; check or store a new text.
+
+    Nothing moves. A text that changes only views of cameras and marks on targets is used at once,
+    and then needs the command authority; any other text takes effect when the plant restarts.
+    """
+    chosen = (check, store, versions, version, waiting, approve, refuse, withdraw)
+    if sum(map(bool, chosen)) > 1:
+        raise InputError("ctl plant-file: use only one option besides --reason and --replaces")
+    if (store or refuse) and not reason.strip():
+        raise InputError("ctl plant-file: a reason is needed; add --reason")
+    with _client(context) as client:
+        if approve or refuse or withdraw:
+            _decide_plant_file(client, approve, refuse, withdraw, reason)
+        elif version:
+            print(client.get(f"plant-file/versions/{quote(version, safe='')}"), end="")
+        elif check is not None:
+            _check_plant_file(client, check, as_json)
+        elif store is not None:
+            text = _toml_of(store)
+            based = replaces or client.get("plant-file")["version"]
+            order = {"text": text, "version": based, "reason": reason}
+            print(client.ask("PUT", "plant-file", order)["text"])
+        else:
+            _show_plant_file(client.get("plant-file"), versions, waiting, as_json)
+
+
+def _toml_of(path: Path) -> str:
+    from heliotrope.field.formats.plant_text import plant_text
+
+    return plant_text(path)
+
+
+def _decide_plant_file(
+    client: "AtPlant | Client", approve: int, refuse: int, withdraw: int, reason: str
+) -> None:
+    """Decide on the text that waits for a second engineer."""
+    path = f"plant-file/waiting/{approve or refuse or withdraw}"
+    if approve:
+        print(client.ask("POST", f"{path}/approve")["text"])
+    elif refuse:
+        client.ask("POST", f"{path}/refuse", {"reason": reason})
+        print(f"change {refuse} refused")
+    else:
+        client.ask("DELETE", path)
+        print(f"change {withdraw} withdrawn")
+
+
+def _check_plant_file(client: "AtPlant | Client", path: Path, as_json: bool) -> None:
+    """Print what the plant finds in a text; the exit code is 1 if it cannot be stored."""
+    found = client.ask("POST", "plant-file/check", {"text": _toml_of(path)})
+    if as_json:
+        print_json(found)
+    else:
+        for one in found["findings"]:
+            line = f"line {one['line']}: " if one["line"] else ""
+            print(f"{one['severity']}: {line}{one['text']}")
+        print("\n".join(found["difference"]) or "no difference from the present file")
+        _print_differs(found["differs"])
+        if found["good"]:
+            print("used at once" if found["at_once"] else "takes effect when the plant restarts")
+    if not found["good"]:
+        raise typer.Exit(1)
+
+
+def _print_differs(differs: list[dict[str, Any]]) -> None:
+    """Print the tables that differ from the text in use."""
+    for one in differs:
+        keys = f" ({', '.join(one['keys'])})" if one["keys"] else ""
+        print(f"{one['how']}: {one['table']} {one['name']}".rstrip() + keys)
+
+
+def _show_plant_file(view: dict[str, Any], versions: bool, waiting: bool, as_json: bool) -> None:
+    """Print the plant file, its versions, or the text that waits."""
+    if as_json:
+        print_json(view)
+    elif versions:
+        print_table(("version", ""), [(one["name"], one["note"]) for one in view["versions"]])
+    elif not waiting:
+        print(view["text"], end="")
+    elif (one := view["waiting"]) is None:
+        print("no text is waiting for approval")
+    else:
+        print(
+            f"change {one['number']} of the plant file, requested by {one['author']} at "
+            f"{_utc(one['at'])}: {one['reason']}; it ends at {_utc(one['until'])}"
+        )
+        print("\n".join(one["difference"]))
+
+
 #: Displayed units: name, and size in the unit of the API.
 _SHOWN = {"rad": ("mrad", 1e-3), "m": ("mm", 1e-3), "1": ("", 1.0)}
 

@@ -107,10 +107,10 @@ class Guard:
             await RedirectResponse(place, 303)(scope, receive, send)
             return
         length = bodies.length_of(headers, route.largest)
-        if length > FORM:
+        if length > route.form:
             # A body longer than the names and points of the whole field would only cost time.
             length = bodies.length_of(
-                headers, FORM + route.per_heliostat * await console.heliostats()
+                headers, route.form + route.per_heliostat * await console.heliostats()
             )
         with contextlib.ExitStack() as stack:
             if length > FORM and who is not None:

@@ -15,11 +15,14 @@ from starlette.types import Scope
 
 from heliotrope.calibration.flights import FlightDocument
 from heliotrope.console.auth import AtLeast, caller
+from heliotrope.plant.interface.orders import PlantFileText
 from heliotrope.plant.orders.authority import Role
 
 #: Largest body, bytes: from a stranger or if none is expected; of a form; of points or names for
 #: every heliostat of the largest field.
 TINY, FORM, LARGEST = 4096, 1 << 14, 16 << 20
+#: The same with the text of a plant file, whatever the size of the field.
+FILE = 1 << 20
 #: The same per heliostat of a plant, bytes: the longest name, and a point with all its digits.
 EACH = 160
 #: The same for a drone flight: 20 orientations with the errors that they share.
@@ -38,7 +41,9 @@ class RouteMatch:
     role
         Minimum role; None if the route is open to all.
     largest, per_heliostat
-        Largest body, and size allowed per heliostat of the plant, bytes.
+        Largest body, and size allowed per heliostat of the plant beyond `form`, bytes.
+    form
+        Size allowed whatever the number of heliostats, bytes.
     allow
         Methods available for the path.
     """
@@ -47,6 +52,7 @@ class RouteMatch:
     role: Role | None = None
     largest: int = TINY
     per_heliostat: int = EACH
+    form: int = FORM
     allow: tuple[str, ...] = ()
 
 
@@ -91,6 +97,8 @@ def _of(route: BaseRoute) -> RouteMatch:
     field = route.body_field
     model = None if field is None else field.field_info.annotation
     role = least_role(route.dependant)
+    if isinstance(model, type) and issubclass(model, PlantFileText):
+        return RouteMatch(200, role, FILE, form=FILE)
     largest = TINY if model is None or role is None else _largest(model)
     return RouteMatch(200, role, largest, EACH_FLOWN if model is FlightDocument else EACH)
 

@@ -195,6 +195,7 @@ class PlantAssembly:
             records=ports.records,
             extra=ports.facts,
             worker=ports.worker,
+            file=ports.file,
         )
         #: When each heliostat last moved, or was ordered to move, on its way to stow at the end.
         self._moved_at = np.full(len(self.names), math.inf)

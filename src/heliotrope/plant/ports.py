@@ -132,6 +132,8 @@ class Ports:
     marks
         Plant file that stores the target views that operators mark; None: these views are lost when
         the program ends.
+    file
+        The plant file, which engineers may replace; None: the plant has no file of its own.
     records
         Store of sightings, events and locks; None: these are lost when the program ends.
     assigned
@@ -162,6 +164,7 @@ class Ports:
     disk: Disk | None = field(default=None, kw_only=True)
     pictures: Pictures | None = field(default=None, kw_only=True)
     marks: Path | None = field(default=None, kw_only=True)
+    file: Path | None = field(default=None, kw_only=True)
     records: Records | None = field(default=None, kw_only=True)
     assigned: Assigned | None = field(default=None, kw_only=True)
     beside: Callable[[], AbstractAsyncContextManager[object]] = field(

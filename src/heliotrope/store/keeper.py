@@ -66,6 +66,8 @@ _LIMITS = "safety limits"
 _EMERGENCY = "emergency"
 #: Name of the document about changes that await approval.
 _CHANGES = "waiting changes"
+#: Name of the document about a plant file that awaits approval.
+_PLANT_FILE = "waiting plant file"
 _AIMED = "aimed by people"
 
 
@@ -509,6 +511,14 @@ class Keeper:
     def keep_waiting_changes(self, document: str) -> None:
         """Replace the document about changes that await approval; an empty one means none do."""
         self._keep_document(_CHANGES, document)
+
+    def waiting_plant_file(self) -> str:
+        """Return the document about a plant file that awaits approval; empty if there is none."""
+        return self._document(_PLANT_FILE)
+
+    def keep_waiting_plant_file(self, document: str) -> None:
+        """Replace the document about a plant file that awaits approval."""
+        self._keep_document(_PLANT_FILE, document)
 
     def aimed_by_people(self) -> tuple[str, ...]:
         """Return the heliostats that operators have aimed, and that keep these aims."""

@@ -596,6 +596,14 @@ class Records(Protocol):
         """Replace the document about changes that await approval; an empty one means none do."""
         ...
 
+    def waiting_plant_file(self) -> str:
+        """Return the document about a plant file that awaits approval; empty if there is none."""
+        ...
+
+    def keep_waiting_plant_file(self, document: str) -> None:
+        """Replace the document about a plant file that awaits approval."""
+        ...
+
     def aimed_by_people(self) -> tuple[str, ...]:
         """Return the heliostats that operators have aimed, and that keep these aims."""
         ...

@@ -379,7 +379,7 @@ def run(
         )
         if twin is not None:
             twin.wait()
-            choice = PlantChoice(twin.folder, twin.folder / LINKS, bool(idle), aimed=up)
+            choice = PlantChoice(twin.folder, twin.folder / LINKS, bool(idle), aimed=up, file=field)
             run_plant(open_plant(twin.folder / PLANT), choice, shown, twin.begin)
             return
         assert clusters is not None
@@ -387,7 +387,7 @@ def run(
             raise InputError("run: --clusters needs a plant file; name it before the options")
         _only_real(speed=speed != 1.0, start=start != "morning", seed=bool(seed))
         folder = field if field.is_dir() else field.parent
-        choice = PlantChoice(folder, clusters, idle is not False, configure, check)
+        choice = PlantChoice(folder, clusters, idle is not False, configure, check, file=field)
         run_plant(open_plant(field), choice, shown)
 
 

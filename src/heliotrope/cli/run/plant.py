@@ -69,8 +69,8 @@ Prepare = Callable[[Keeper, Plant, datetime], Awaitable[None]]
 class PlantChoice:
     """Options of a plant on the command line; see `cli.run.command`.
 
-    ``aimed`` means that the heliostats of a simulated field track the design's aims when the plant
-    starts.
+    ``file`` is the file or folder with which the plant was started. ``aimed`` means that the
+    heliostats of a simulated field track the design's aims when the plant starts.
     """
 
     folder: Path
@@ -79,6 +79,12 @@ class PlantChoice:
     configure: bool = False
     check: bool = False
     aimed: bool = False
+    file: Path | None = None
+
+    @property
+    def plant_file(self) -> Path | None:
+        """The plant's file, if it is in our own format."""
+        return self.file if self.file is not None and self.file.suffix == ".toml" else None
 
 
 def run_plant(
@@ -339,7 +345,7 @@ async def _run(
             await prepare(keeper, design, outside.clock.utc())
         ports = outside.ports(design, choice, shown, keeper, worker)
         kept = pictures(shown, folder, waits=outside.fast)
-        ports = replace(ports, pictures=kept, marks=shown.marks)
+        ports = replace(ports, pictures=kept, marks=shown.marks, file=choice.plant_file)
         live = PlantAssembly(design, ports, _settings(design, choice, shown, outside))
         if choice.aimed:
             live.aim_as_designed()

@@ -5,6 +5,7 @@ import { ask, chart, clock, count, degrees, facts, h, moment, mrad, number, refr
 import { act, aim, askAnd } from "./orders.js";
 import { drawFlux, fluxPoint, listed as listedIn } from "./showing.js";
 import { markCorners } from "./marking.js";
+import { editPlantFile } from "./plantfile.js";
 import { compareVersions, waitingChanges, waitingView } from "./versions.js";
 import { day as dayOf, fixed, monthDay, t, word } from "./words.js";
 
@@ -26,7 +27,9 @@ export function plant(box) {
   const choice = h("select", { ariaLabel: t("Receiver"), onchange: () => { name = choice.value; predict(); } }, receivers.map((one) => h("option", { value: one }, one)));
   box.append(h("h3", {}, t("Heliostats")), states, proof, h("h3", {}, t("Sun")), light, sensors,
     ...(name ? [h("h3", {}, t("Predicted flux on the receiver")), receivers.length > 1 ? choice : "", figures, flux, h("label", { title: t("By the errors of the calibrations; sunlight, reflectivity and soiling come on top.") }, unsure, " ", t("Standard deviation")), measured, limit,
-      canCommand() ? h("p", { className: "hx-hint" }, t("Click on the picture to aim the heliostats of the scope at that point.")) : ""] : []));
+      canCommand() ? h("p", { className: "hx-hint" }, t("Click on the picture to aim the heliostats of the scope at that point.")) : ""] : []),
+    me.role === "engineer" ? h("div", { className: "hx-row" }, h("button", { className: "hx-button", title: t("Targets, receivers, cameras and everything else that the plant file says: check a new text, store it, see its versions"),
+      onclick: () => act(editPlantFile, t("plant file"), false) }, t("Plant file…"))) : "");
   let seen = null;
   const show = () => {
     const head = store.head;

@@ -166,6 +166,11 @@ def versions(path: str | Path) -> list[Version]:
     return stored
 
 
+def version_folder(path: str | Path, version: str) -> Path:
+    """Return the folder of a stored version, whose name `versions` has returned."""
+    return _versions(Path(path)) / version
+
+
 def restore(path: str | Path, version: str, *, note: str = "", now: datetime | None = None) -> str:
     """Restore a stored version; return the name under which the replaced file was stored.
 
@@ -304,7 +309,7 @@ class _Files:
         """Check the changed file as a whole; yield its warnings."""
         with tempfile.TemporaryDirectory(dir=self.place.parent, prefix=".plant-") as folder:
             self.write(Path(folder))
-            for name in _named_files(self.document, self.place.parent):
+            for name in named_files(self.document, self.place.parent):
                 link = Path(folder) / name
                 link.parent.mkdir(parents=True, exist_ok=True)
                 if not link.exists():
@@ -331,13 +336,13 @@ class _Files:
         write_text(home / self.place.name, tomlkit.dumps(self.document))
 
 
-def _named_files(table: Any, home: Path) -> Iterator[PurePath]:
+def named_files(table: Any, home: Path) -> Iterator[PurePath]:
     """Yield the files and folders that a plant file refers to, such as maps and meshes."""
     if isinstance(table, Mapping):
         table = list(table.values())
     if isinstance(table, list):
         for value in table:
-            yield from _named_files(value, home)
+            yield from named_files(value, home)
     elif isinstance(table, str) and table.strip("./") and len(table) < 256:
         name = PurePath(str(table))
         if not name.is_absolute() and ".." not in name.parts and (home / name).exists():
@@ -373,6 +378,19 @@ def _unit(name: str) -> str:
 
 def _versions(path: Path) -> Path:
     return path.with_name(f"{path.stem}.versions")
+
+
+def keep_files(place: Path, table: PurePath, change: str, now: datetime) -> str:
+    """Store a plant file and its table as they are on disk, even if they cannot be used.
+
+    Returns the name of the version; ``change`` describes the change that replaces it.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be written.
+    """
+    return _keep(place, table, change, "", now)
 
 
 def _keep(place: Path, table: PurePath, change: str, note: str, now: datetime | None) -> str:

@@ -53,10 +53,11 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class Finding:
-    """An error or a warning about a plant file."""
+    """An error or a warning about a plant file, and the place in its TOML file ("": unknown)."""
 
     severity: Literal["error", "warning"]
     text: str
+    where: str = ""
 
 
 def read_plant(path: str | Path) -> Plant:
@@ -359,18 +360,27 @@ def json_schema() -> dict[str, Any]:
 
 def check_plant(path: str | Path) -> list[Finding]:
     """Return all errors and warnings about a plant file."""
+    return examine_plant(path)[0]
+
+
+def examine_plant(path: str | Path) -> tuple[list[Finding], Plant | None]:
+    """Return all errors and warnings about a plant file, and the plant if there are no errors."""
     place = Path(path)
     try:
         document = read_document(place, "plant", PlantDocument, _MODELS)
         table = read_table(place.parent / document.heliostats)
     except FormatError as error:
-        return [Finding("error", str(error))]
+        return [_error(place, error)], None
     problems = list(table.problems)
     plant = None if problems else _assemble(place, document, table, problems)
-    findings = [Finding("error", str(problem)) for problem in problems]
-    return (
-        findings if plant is None else findings + [Finding("warning", w) for w in _warnings(plant)]
-    )
+    findings = [_error(place, problem) for problem in problems]
+    if plant is None:
+        return findings, None
+    return findings + [Finding("warning", text) for text in _warnings(plant)], plant
+
+
+def _error(place: Path, problem: FormatError) -> Finding:
+    return Finding("error", str(problem), problem.where if problem.path == str(place) else "")
 
 
 def _warnings(plant: Plant) -> list[str]:

@@ -19,6 +19,7 @@ from pydantic import BaseModel
 
 from heliotrope.calibration.flights import FlightDocument, parse_flight
 from heliotrope.errors import InputError
+from heliotrope.field.formats.plant_help import HelpTable, plant_help
 from heliotrope.field.timetable import TimetableEntry
 from heliotrope.plant.attempts import Retry
 from heliotrope.plant.interface import orders
@@ -31,6 +32,11 @@ from heliotrope.plant.operations import views
 from heliotrope.plant.operations.aiming import AimsView
 from heliotrope.plant.operations.approvals import WaitingChange
 from heliotrope.plant.operations.marking import MarksView, PictureToMark
+from heliotrope.plant.operations.plant_file import (
+    PlantFileCheck,
+    PlantFileStored,
+    PlantFileView,
+)
 from heliotrope.plant.operations.report import ShiftReport
 from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.plant.operations.trends import Quantity, Trend
@@ -688,6 +694,73 @@ def refuse_change(desk: Desk, who: Person, order: orders.RefusedChange) -> None:
 def withdraw_change(desk: Desk, who: Person, order: orders.OneChange) -> None:
     """Withdraw your own change."""
     desk.operations.approvals.withdraw(who, order.number)
+
+
+# -- the plant file ------------------------------------------------------------------------------
+
+
+@_call("GET plant-file", "plant file", ENGINEER)
+async def plant_file(desk: Desk, who: Person) -> PlantFileView:
+    """Return the [plant file](plant-format.md), its stored versions, and the text that waits.
+
+    `differs`: the tables that differ from the text in use, which take effect when the plant
+    restarts; `waiting`: a text that waits for the approval of a second engineer.
+    """
+    return await desk.operations.plant_file.view(who)
+
+
+@_call("GET plant-file/help", "plant file", fresh=ALWAYS)
+def plant_file_help(desk: Desk) -> tuple[HelpTable, ...]:
+    """Return the keys of each table of a plant file, with their kind, limits and meaning."""
+    del desk
+    return plant_help()
+
+
+@_call("GET plant-file/versions/{name}", "plant file", ENGINEER)
+async def plant_file_version(desk: Desk, who: Person, order: orders.Named) -> str:
+    """Return the text of a stored version of the plant file."""
+    return await desk.operations.plant_file.stored(who, order.name)
+
+
+@_call("POST plant-file/check", "plant file", ENGINEER)
+async def check_plant_file(desk: Desk, who: Person, order: orders.PlantFileText) -> PlantFileCheck:
+    """Check a text as `heliotrope field check` would check the plant file; nothing is written.
+
+    Returns errors and warnings with their lines, and the differences from the present file.
+    `at_once`: the plant would use the text at once, because it differs only in views of cameras and
+    marks on targets; otherwise it takes effect when the plant restarts.
+    """
+    return await desk.operations.plant_file.check(who, order.text)
+
+
+@_call("PUT plant-file", "plant file", ENGINEER)
+async def put_plant_file(desk: Desk, who: Person, order: orders.PlantFileOrder) -> PlantFileStored:
+    """Replace the plant file by a text without errors, and keep the old one; nothing moves.
+
+    `version` is the version of the text that you changed, as returned with it; if the file has
+    changed since, nothing is stored. The `reason` is recorded. A text that is used at once needs
+    the command authority. If the plant file requires a
+    [second approval](plant-format.md#second-approval), nothing is written until then.
+    """
+    return await desk.operations.plant_file.store(who, order.text, order.version, order.reason)
+
+
+@_call("POST plant-file/waiting/{number}/approve", "plant file", ENGINEER)
+async def approve_plant_file(desk: Desk, who: Person, order: orders.OneChange) -> PlantFileStored:
+    """Approve another engineer's text, which is then stored; if that fails, it waits on."""
+    return await desk.operations.plant_file.approve(who, order.number)
+
+
+@_call("POST plant-file/waiting/{number}/refuse", "plant file", ENGINEER, body=orders.ReasonGiven)
+def refuse_plant_file(desk: Desk, who: Person, order: orders.RefusedChange) -> None:
+    """Refuse another engineer's text, with a `reason`."""
+    desk.operations.plant_file.refuse(who, order.number, order.reason)
+
+
+@_call("DELETE plant-file/waiting/{number}", "plant file", ENGINEER)
+def withdraw_plant_file(desk: Desk, who: Person, order: orders.OneChange) -> None:
+    """Withdraw your own text of the plant file."""
+    desk.operations.plant_file.withdraw(who, order.number)
 
 
 # -- photographs ---------------------------------------------------------------------------------

@@ -240,6 +240,22 @@ class RefusedChange(OneChange, ReasonGiven):
     """The number of a change, and why it is refused."""
 
 
+#: Longest text of a plant file, characters: a request must fit into a frame however it is escaped.
+LONGEST_FILE = 160_000
+
+
+class PlantFileText(Strict):
+    """The text of a plant file (TOML)."""
+
+    text: Annotated[str, Field(min_length=1, max_length=LONGEST_FILE)]
+
+
+class PlantFileOrder(PlantFileText, ReasonGiven):
+    """A new text of the plant file, the version of the text that it replaces, and the reason."""
+
+    version: Annotated[str, Field(max_length=64)]
+
+
 class TwoVersions(Strict):
     """A heliostat and two versions of its parameters; 0 is the version in the plant file."""
 

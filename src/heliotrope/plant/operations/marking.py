@@ -3,13 +3,13 @@
 `heliotrope camera teach` does the same without a running plant (`imaging.targets.teaching`). Here
 the running camera uses the new view for its next photograph, and a plant file in the data folder
 stores it in the form that teaching writes, with dated copies of older versions. The plant's own
-file is not changed, because the program must not be able to change it, and because in a simulation
-that file describes the true cameras.
+file is not changed, because in a simulation that file describes the true cameras; `plant_file`
+changes it, and then its views are used.
 """
 
 import asyncio
 import base64
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -20,6 +20,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.camera import Camera, project
 from heliotrope.field.formats.plant_edit import keep_version
 from heliotrope.field.formats.plant_file import read_plant, write_plant
+from heliotrope.field.marks import Mark
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
@@ -151,6 +152,30 @@ class MarksView:
     rectified: str
 
 
+@dataclass(frozen=True)
+class NewViews:
+    """Views from a new plant file.
+
+    Attributes
+    ----------
+    cameras, surfaces
+        Cameras of the new views, and targets with new marks.
+    targets
+        Targets whose photographs are evaluated differently.
+    pictures
+        Reference pictures of the new marks.
+    """
+
+    cameras: tuple[Camera, ...]
+    surfaces: tuple[Target, ...]
+    targets: frozenset[str]
+    pictures: Mapping[str, FloatArray]
+
+    def read(self, folder: Path) -> Mapping[str, FloatArray]:
+        """Return the reference pictures of the new marks, which are in a folder."""
+        return read_pictures(folder, self.surfaces)
+
+
 class Marking:
     """Accepts the views that users mark.
 
@@ -174,7 +199,8 @@ class Marking:
         file: Path | None = None,
     ) -> None:
         self._cameras, self._plant, self._log, self._file = cameras, plant, log, file
-        self._design = plant.design
+        #: The design in use, and the design of the plant's own file.
+        self._design = self._own = plant.design
         self._held: dict[int, tuple[str, Frame]] = {}
         self._number = 0
 
@@ -210,20 +236,51 @@ class Marking:
             name = self._cameras.eye(target).name
         except UnknownNameError:
             return None
-        return next((c for c in self._plant.design.cameras if c.name == name), None)
+        return next((c for c in self._own.cameras if c.name == name), None)
+
+    # -- a new plant file ------------------------------------------------------------------
+
+    def sees(self, target: str) -> bool:
+        """Return whether a camera observes a target."""
+        return self._camera_of(target) is not None
+
+    def views(self, cameras: Sequence[Camera], surfaces: Sequence[Target]) -> NewViews:
+        """Return the views of the changed cameras and targets of a new plant file."""
+        changed = {camera.name for camera in cameras}
+        marked = {surface.name for surface in surfaces}
+        seen = [t.name for t in self._own.targets if self.sees(t.name)]
+        targets = frozenset(
+            name for name in seen if name in marked or self._cameras.eye(name).name in changed
+        )
+        return NewViews(tuple(cameras), tuple(surfaces), targets, {})
+
+    def take_file(self, views: NewViews) -> None:
+        """Use views from a new plant file, instead of views that users marked."""
+        cameras = {camera.name: camera for camera in views.cameras}
+        for surface in views.surfaces:
+            self._own = _marked(self._own, surface)
+            self._design = _marked(self._design, surface)
+        for camera in views.cameras:
+            self._own = with_camera(self._own, _seeing(self._own.camera(camera.name), camera))
+        for target in sorted(views.targets):
+            self._design = _marked(self._design, self._own.target(target))
+            eye = self._cameras.eye(target)
+            if eye.name in cameras:
+                eye = _seeing(eye, cameras[eye.name])
+                self._design = with_camera(self._design, eye)
+            self._cameras.take_view(eye, self._design.target(target), views.pictures)
 
     def _fits(self, before: Plant, camera: Camera, target: str) -> bool:
         """Return whether the plant's own file still contains the view from before the marking."""
         old = next((c for c in before.cameras if c.name == camera.name), None)
         then = next((t for t in before.targets if t.name == target), None)
-        now = self._plant.design.target(target)
+        now = self._own.target(target)
         return (
             old is not None
             and then is not None
             and camera.size == old.size
             and _near(now.corners, then.corners)
-            and [(m.name, m.kind, m.code) for m in now.marks]
-            == [(m.name, m.kind, m.code) for m in then.marks]
+            and _alike(now.marks, then.marks)
             and all(_near(getattr(camera, part), getattr(old, part)) for part in _VIEW)
         )
 
@@ -383,7 +440,7 @@ class Marking:
                 change = f"{target.name}: corners marked in the console by {person}"
                 keep_version(self._file, change, now=self._plant.clock.utc())
             self._file.parent.mkdir(parents=True, exist_ok=True)
-            write_plant(self._plant.design, _before(self._file))
+            write_plant(self._own, _before(self._file))
             write_taught(replace(taught, plant=new), self._file)
         except OSError as error:
             raise InputError(
@@ -404,11 +461,31 @@ def _near(a: FloatArray | None, b: FloatArray | None) -> bool:
     return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-9, atol=1e-6))
 
 
+def _alike(one: Sequence[Mark], other: Sequence[Mark]) -> bool:
+    """Return whether two lists of marks are equal to the precision of a file."""
+    return [(m.name, m.kind, m.code) for m in one] == [
+        (m.name, m.kind, m.code) for m in other
+    ] and all(
+        _near(np.array([*a.point, a.size, a.stroke, a.turn]),
+              np.array([*b.point, b.size, b.stroke, b.turn]))
+        for a, b in zip(one, other, strict=True)
+    )  # fmt: skip
+
+
 def _with(plant: Plant, camera: Camera, target: Target) -> Plant:
     """Return a plant with one camera replaced, and with new marks on a target."""
+    return with_camera(_marked(plant, target), camera)
+
+
+def _marked(plant: Plant, target: Target) -> Plant:
+    """Return a plant with new marks on a target."""
     here = replace(plant.target(target.name), marks=target.marks)
-    targets = tuple(here if t.name == target.name else t for t in plant.targets)
-    return with_camera(replace(plant, targets=targets), camera)
+    return replace(plant, targets=tuple(here if t.name == here.name else t for t in plant.targets))
+
+
+def _seeing(camera: Camera, new: Camera) -> Camera:
+    """Return a camera with the view of another one."""
+    return replace(camera, **{part: getattr(new, part) for part in (*_VIEW, "deviation")})
 
 
 def _expected(camera: Camera, point: FloatArray, size: tuple[int, int]) -> Pixel | None:

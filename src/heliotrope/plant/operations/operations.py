@@ -42,6 +42,7 @@ from heliotrope.plant.operations.history import History, figures
 from heliotrope.plant.operations.logbook import MOST_NAMED, Logbook
 from heliotrope.plant.operations.marking import Marking
 from heliotrope.plant.operations.pictures import Pictures
+from heliotrope.plant.operations.plant_file import PlantFile
 from heliotrope.plant.operations.predicted_flux import PredictedFlux
 from heliotrope.plant.operations.report import ShiftReport, period, report
 from heliotrope.plant.operations.security import SecurityLog
@@ -130,11 +131,13 @@ class Operations:
         Function that returns additional rows for the summary, such as the speed of a twin.
     worker
         Where computations run; see `Worker`.
+    file
+        The plant file; None: the plant has no file of its own.
 
     Attributes
     ----------
     plant, logbook, automatic, viewer, security, pictures, parameters, approvals, marking,
-    flux_check
+    flux_check, plant_file
         The parts of the plant; see their classes. Callers access them directly.
     telemetry
         Folder of the telemetry; None: no telemetry is archived.
@@ -152,6 +155,7 @@ class Operations:
         records: Records | None = None,
         extra: Callable[[], Mapping[str, Any]] | None = None,
         worker: Worker = at_once,
+        file: Path | None = None,
     ) -> None:
         self.plant, self.logbook, self.automatic, self._extra = plant, logbook, automatic, extra
         self.pictures, self.marking = photography.pictures, photography.marking
@@ -161,6 +165,9 @@ class Operations:
         self.viewer = Viewer(plant, self.automatic)
         self.parameters = TypedParameters(plant, logbook, records)
         self.approvals = Approvals(plant, logbook, self.parameters, self.errands, records)
+        self.plant_file = PlantFile(
+            file, plant, logbook, self.marking, self._visited, worker, records
+        )
         self.telemetry: Path | None = None
         self._history = History(plant, records, self._figures)
         self._records = records
@@ -175,6 +182,7 @@ class Operations:
         """Run until closed; the owner runs the plant controller itself."""
         self.logbook.event("plant", "", f"{self.plant.design.name}: operations begin")
         self.approvals.recall()
+        self.plant_file.recall()
         self._aiming.recall()
         self.begun.set()
         async with contextlib.aclosing(self._flux), asyncio.TaskGroup() as group:
@@ -209,12 +217,17 @@ class Operations:
         """Track the operators' operations until they end."""
         while True:
             self.approvals.step()
+            self.plant_file.step()
             self.errands.look()
             await sleep_until(self.plant.clock, self.plant.now() + _FOLLOWED)
 
     async def close(self) -> None:
         """Stop automatic control; beams stay where they are, so stow the field first."""
         self._closing.set()
+
+    def _visited(self) -> dict[str, str]:
+        """Return the heliostat of the visit on each target in use."""
+        return {visit.target: visit.heliostat for visit in self.automatic.view().running}
 
     # -- the field -------------------------------------------------------------------------
 
