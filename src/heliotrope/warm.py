@@ -31,7 +31,7 @@ def main() -> None:
     with compiling():
         following()
         guarding()
-    for part in (searching, breaking, tracking, fitting, lighting, cutting):
+    for part in (searching, breaking, tracking, fitting, hiding, lighting, cutting):
         part()
 
 
@@ -60,7 +60,7 @@ def compiling() -> Iterator[None]:
 
 def controlling() -> None:
     """Compile or load the kernels of a plant's loop in advance, so that the loop is not delayed."""
-    for part in (tracking, following, guarding):
+    for part in (tracking, following, guarding, hiding):
         part()
 
 
@@ -135,6 +135,20 @@ def guarding() -> None:
         Box("far", (900.0, 0.0, 0.0), (1.0,) * 3),
     ]
     sweep(mechanism.armature, path, (0.0, -0.6, 0.8), MirrorOptics.of([2.0], [2.0]), volumes)
+
+
+def hiding() -> None:
+    """Find the mirrors that hide a part of another mirror."""
+    import numpy as np
+
+    from heliotrope.optics import Mirrors, Scene, Shading
+
+    center, normal = (
+        np.array([[0.0, 50.0, 0.0], [0.0, 56.0, 0.0]]),
+        np.array([[0.0, -0.6, 0.8]] * 2),
+    )
+    mirrors = Mirrors.of(center, normal, (np.full(2, 3.0),) * 2, np.array([0.0, 0.0, 30.0]))
+    Shading(Scene(np.array([0.0, -0.6, 0.8]), 0.0, mirrors, ())).hiding(0)
 
 
 def lighting() -> None:

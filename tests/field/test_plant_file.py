@@ -640,7 +640,7 @@ def test_receiver_visits_are_read_and_survive(tmp_path: Path) -> None:
     [
         (
             "power = 0.02",
-            "receiver_visits: receiver visits: power 0.02 (largest fraction of the power",
+            "receiver_visits: receiver visits: power (largest fraction of the power",
         ),
         ("movement = 1", "receiver_visits.movement: "),
         ("worth_mrad = 1\nworth_rad = 0.001", "worth is set twice"),

@@ -32,6 +32,9 @@ class Kept:
         self.versions: list[HeliostatCalibration] = []
         self.told: list[str] = []
 
+    async def read(self, query: Callable[["Kept"], Any]) -> Any:
+        return query(self)
+
     def calibration_history(self, heliostat: str) -> list[HeliostatCalibration]:
         return [one for one in self.versions if one.heliostat == heliostat]
 
