@@ -82,7 +82,7 @@ def read_sightings(
 
     Returns
     -------
-    M sightings in the order of the file, their kinds ("" if not specified), and one message for
+    M sightings in the order of the file, their kinds (empty if not specified), and one message for
     each row that could not be used.
 
     Raises

@@ -45,29 +45,29 @@ def surface(
     from heliotrope.optics.learnt_surface import spread_over_suns
 
     plant = open_plant(place)
-    found = read_beams(plant, photographs, heliostat)
+    result = read_beams(plant, photographs, heliostat)
     facets, focal = _design(plant, heliostat)
-    used = spread_over_suns(found.photographs, learn) if found.photographs else []
-    learnt = learn_surface([found.photographs[k] for k in used], facets, focal)
-    rest = [k for k in range(len(found.names)) if k not in used]
-    beams = [learnt.predict(photograph) for photograph in found.photographs]
-    right = [beam_accuracy(p.beam, b) for p, b in zip(found.photographs, beams, strict=True)]
+    used = spread_over_suns(result.photographs, learn) if result.photographs else []
+    learnt = learn_surface([result.photographs[k] for k in used], facets, focal)
+    rest = [k for k in range(len(result.names)) if k not in used]
+    beams = [learnt.predict(photograph) for photograph in result.photographs]
+    right = [beam_accuracy(p.beam, b) for p, b in zip(result.photographs, beams, strict=True)]
     slopes = learnt.slopes()
     if out is not None:
         write_slopes(out, slopes)
     if pictures is not None:
         shown = rest or used
-        draw_beams(pictures, [(found.photographs[k].beam, beams[k]) for k in shown])
+        draw_beams(pictures, [(result.photographs[k].beam, beams[k]) for k in shown])
     tested = [right[k] for k in rest]
     document = {
         "heliostat": heliostat,
         "focal_m": focal if np.isfinite(focal) else None,
         "slope_rms_mrad": 1e3 * float(np.sqrt((slopes**2).mean())),
         "slope_error_mrad": 1e3 * learnt.slope_error,
-        "learnt_from": {found.names[k]: right[k] for k in used},
-        "tested_on": {found.names[k]: right[k] for k in rest},
+        "learnt_from": {result.names[k]: right[k] for k in used},
+        "tested_on": {result.names[k]: right[k] for k in rest},
         "median_accuracy": float(np.median(tested)) if tested else None,
-        "left_out": list(found.left_out),
+        "left_out": list(result.left_out),
     }
     if as_json:
         print_json(document)
@@ -87,7 +87,7 @@ def surface(
         print(
             f"{len(rest)} others: accuracy {np.median(tested):.3f} (median), 90 % above {low:.3f}"
         )
-    for line in found.left_out:
+    for line in result.left_out:
         print(f"left out: {line}")
 
 

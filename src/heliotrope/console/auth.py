@@ -184,7 +184,7 @@ class Caller:
     expires
         End of the session or token, POSIX s; None if it never ends.
     owes
-        Action that the person must take first, see `DUES`; "" if there is none.
+        Action that the person must take first, see `DUES`; empty if there is none.
     factor
         Whether the account has a second factor.
     by_proxy

@@ -110,7 +110,7 @@ class ByProxy:
 
 
 def _text(header: str) -> str:
-    """Return the text of a header, which is UTF-8; "" if the header is not valid UTF-8."""
+    """Return the text of a header, which is UTF-8; empty if the header is not valid UTF-8."""
     try:
         return unicodedata.normalize("NFC", header.encode("latin-1").decode())
     except UnicodeError:

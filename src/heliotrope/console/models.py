@@ -142,7 +142,7 @@ class AccountChange(Confirmed):
 
 
 class OwnPassword(Strict):
-    """Your password ("" if your account has none yet), and your new password."""
+    """Your password (empty if your account has none yet), and your new password."""
 
     old: Annotated[str, Field(max_length=200)]
     new: Annotated[str, Field(min_length=10, max_length=200)]

@@ -120,7 +120,7 @@ class Heliostat(Value, Framed):
 
     @property
     def cluster(self) -> str:
-        """Name of its cluster; "" if it has none."""
+        """Name of its cluster; empty if it has none."""
         return self.heliostats.cluster[0] if self.heliostats.cluster else ""
 
     @property

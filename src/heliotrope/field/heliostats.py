@@ -123,7 +123,7 @@ class Heliostats(Value, Framed):
     aim
         Aim points in operation, ENU metres, (N, 3); NaN if not specified.
     cluster
-        Name of each heliostat's cluster; "" if it has none.
+        Name of each heliostat's cluster; empty if it has none.
     machines
         Motor limits and rest positions of each heliostat, or () if the plant file does not specify
         them.

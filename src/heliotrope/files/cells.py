@@ -148,7 +148,7 @@ class Rows:
         self.reasons.setdefault(int(i), (column, reason))
 
     def texts(self, column: str) -> list[str]:
-        """Return the cells as texts; "" if a cell is empty or there is no such column."""
+        """Return the cells as texts; empty if a cell is empty or there is no such column."""
         if column not in self.columns:
             return [""] * len(self)
         return ["" if _empty(cell) else str(cell) for cell in self.columns[column]]

@@ -100,7 +100,7 @@ def foreign(path: Path, start: bytes) -> str:
 
 
 def instead(start: bytes, what: str, own: str = "") -> str:
-    """Return the kind of a file that is not ``what``, and the command for it; "" if unknown.
+    """Return the kind of a file that is not ``what``, and the command for it; empty if unknown.
 
     Parameters
     ----------

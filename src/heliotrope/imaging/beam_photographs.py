@@ -67,7 +67,7 @@ def read_beams(plant: Plant, folder: str | Path, heliostat: str) -> BeamFolder:
     place = Path(folder)
     group, row = plant.find(heliostat)
     files = sorted(place.glob(f"*{_PROPERTIES}")) if place.is_dir() else []
-    names, found, left_out = [], [], []
+    names, result, left_out = [], [], []
     for file in files:
         start = file.name.removesuffix(_PROPERTIES)
         picture = next((p for end in _ENDS if (p := place / f"{start}{end}").is_file()), None)
@@ -84,13 +84,13 @@ def read_beams(plant: Plant, folder: str | Path, heliostat: str) -> BeamFolder:
         names.append(picture.name)
         mechanism = group.take(np.array([row])).calibrated
         R, vertex = orientation(mechanism, np.array([properties.motors]))
-        found.append(_posed(target, beam, properties, R[0], vertex[0]))
+        result.append(_posed(target, beam, properties, R[0], vertex[0]))
     if not files:
         raise FormatError(
             place,
             f"there is no ID{_PROPERTIES}; put pictures of the target and their properties there",
         )
-    return BeamFolder(tuple(names), tuple(found), tuple(left_out))
+    return BeamFolder(tuple(names), tuple(result), tuple(left_out))
 
 
 def _posed(

@@ -575,7 +575,7 @@ class Motion:
     # Time.
 
     def tick(self, elapsed_ms: int) -> str:
-        """Advance the motion; return an event of the state table, or "" if there is none."""
+        """Advance the motion; return an event of the state table, or empty if there is none."""
         self._knot_ms = max(0, self._knot_ms - elapsed_ms)
         self._renew_ms = max(0, self._renew_ms - elapsed_ms)
         self._since_ms = min(self._since_ms + elapsed_ms, KNOT_MS)

@@ -54,7 +54,7 @@ MOTIONS = {
 
 
 def transitions() -> list[tuple[int, str, int, str]]:
-    """Return all transitions: state, event, new state, and motion ("" if none starts)."""
+    """Return all transitions: state, event, new state, and motion (empty if none starts)."""
     rows = []
     for line in states.TABLE.split("\n"):
         if line:

@@ -144,7 +144,7 @@ FAULT FAULTED FAULT
 
 
 def transition(state: int, event: str) -> "tuple[int, str] | None":
-    """Return the new state and the motion ("" if none starts); None if the event is refused."""
+    """Return the new state and the motion (empty if none starts); None if the event is refused."""
     key = "\n" + STATES[state] + " " + event + " "
     start = TABLE.find(key)
     if start < 0:

@@ -139,7 +139,7 @@ def _single(codes: str) -> str:
 
 
 def _refusal(code: str, value: "Any") -> str:
-    """Return the reason why a value does not fit a code; "" if it fits."""
+    """Return the reason why a value does not fit a code; empty if it fits."""
     if code == "s":
         return "" if isinstance(value, (bytes, bytearray)) else f"{value!r} is not bytes"
     if code in RANGES:

@@ -228,7 +228,7 @@ def utc_of_week(week: int, time_of_week_ms: int, not_before: datetime) -> dateti
 # -- virtual time ----------------------------------------------------------------------
 
 
-#: The simulated program to which a task belongs, "" if it belongs to none; see
+#: The simulated program to which a task belongs, empty if it belongs to none; see
 #: `VirtualLoop.freeze`.
 PROGRAM: ContextVar[str] = ContextVar("PROGRAM", default="")
 

@@ -99,7 +99,7 @@ class Keys:
     Attributes
     ----------
     plant, password
-        Keys of the plant, and password of the broker; () and "" if absent.
+        Keys of the plant, and password of the broker; () and empty if absent.
     members
         Keys of the table, by name.
 

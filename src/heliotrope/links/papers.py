@@ -41,7 +41,7 @@ class _Renewal:
         self.count = 0
 
     def look(self) -> str:
-        """Load changed files; return why they cannot be used, or "" if they can.
+        """Load changed files; return why they cannot be used, or empty if they can.
 
         Files that cannot be used are tried again at each check.
         """

@@ -385,7 +385,7 @@ def _role(role: str, known: dict[str, Parameter]) -> tuple[str, ...]:
 
 
 def unit_of(name: str) -> str:
-    """Return the unit of a parameter; "" if it has none."""
+    """Return the unit of a parameter; empty if it has none."""
     rows = (*_PLACE, *_JOINTS.values(), _SAG)
     units = {row.name: row.unit for row in rows}
     units |= {suffix: row.unit for suffix, _, row in (*_ANY_DRIVE, *_LINEAR_DRIVE)}

@@ -111,8 +111,8 @@ class LearntSurface:
         view = _View(photograph, self.facets, self.focal, light, self.degree)
         image, _ = view.image(self.coefficients, self.slope_error**2, np.zeros(2))
         grid = photograph.beam
-        found = Beam(np.maximum(image, 0.0), view.step, view.origin)
-        return found.shifted(grid.centroid - found.centroid).of_power(grid.power)
+        result = Beam(np.maximum(image, 0.0), view.step, view.origin)
+        return result.shifted(grid.centroid - result.centroid).of_power(grid.power)
 
 
 def beam_accuracy(measured: Beam, predicted: Beam) -> float:
@@ -122,9 +122,9 @@ def beam_accuracy(measured: Beam, predicted: Beam) -> float:
     """
     rows, columns = np.indices(measured.flux.shape)
     places = measured.origin + measured.step * np.stack([columns, rows], axis=-1)
-    found = predicted.at(places)
-    one, other = measured.flux / measured.flux.sum(), found / found.sum()
-    return float(1.0 - 0.5 * np.abs(one - other).sum())
+    result = predicted.at(places)
+    shares = measured.flux / measured.flux.sum() - result / result.sum()
+    return float(1.0 - 0.5 * np.abs(shares).sum())
 
 
 def learn_surface(
@@ -186,11 +186,11 @@ def learn_surface(
     start = np.zeros(count * size + 1 + 2 * len(views))
     limits: list[Any] = [(None, None)] * len(start)
     limits[count * size] = tuple(2.0 * np.log(r / _ROUGH) for r in _ROUGHS)
-    found = minimize(
+    result = minimize(
         cost, start, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": _ROUNDS}
     )
-    own = found.x[: count * size].reshape(count, size) * prior
-    rough = float(_ROUGH * np.exp(0.5 * found.x[count * size]))
+    own = result.x[: count * size].reshape(count, size) * prior
+    rough = float(_ROUGH * np.exp(0.5 * result.x[count * size]))
     learnt = LearntSurface(facets, focal, own, rough, np.zeros(0))
     right = [beam_accuracy(p.beam, learnt.predict(p, shape)) for p in photographs]
     return LearntSurface(facets, focal, own, rough, np.array(right))

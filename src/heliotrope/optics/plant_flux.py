@@ -101,7 +101,7 @@ class FieldOptics:
         UnknownNameError
             If there is no such attribute.
         """
-        known = [each.name for each in fields(self)]
+        known = [item.name for item in fields(self)]
         for name in changes:
             if name not in known:
                 raise UnknownNameError("option of the light", name, known)
@@ -274,7 +274,7 @@ def field_efficiencies(shares: Efficiencies, area: FloatArray) -> dict[str, floa
     for stage in ("lit", "mirror", "air"):
         light.append(light[-1] * np.nan_to_num(getattr(shares, stage)))
     light.append(np.nan_to_num(area * shares.total))
-    sums = [float(each.sum()) for each in light]
+    sums = [float(item.sum()) for item in light]
 
     def share(part: float, whole: float) -> float:
         return part / whole if whole > 0.0 else float("nan")
@@ -419,14 +419,14 @@ def _traced(
         traced.cosine, traced.shading, traced.blocking, traced.lit, mirror, air, traced.intercept,
         total,
     )  # fmt: skip
-    left = float((m.area * traced.cosine * mirror * air * np.nan_to_num(traced.lit)).sum())
+    rest = float((m.area * traced.cosine * mirror * air * np.nan_to_num(traced.lit)).sum())
     views = [
-        _view(s, f, float(p), float(p) / max(left * scene.dni, 1e-300), int((traced.lit > 0).sum()))
+        _view(s, f, float(p), float(p) / max(rest * scene.dni, 1e-300), int((traced.lit > 0).sum()))
         for s, f, p in zip(scene.surfaces, traced.flux, traced.power, strict=True)
     ]
-    found = _result(plant, scene, shares, views)
+    result = _result(plant, scene, shares, views)
     spread = float(np.sqrt(np.sum(traced.power_error**2)))
-    return replace(found, rays=int(rays), errors=traced.error, power_error=spread)
+    return replace(result, rays=int(rays), errors=traced.error, power_error=spread)
 
 
 def _result(plant: Plant, scene: Scene, shares: Efficiencies, maps: list[FluxView]) -> PlantFlux:
@@ -632,7 +632,7 @@ def flux_year(
     )
     weight = np.ones_like(grid[0])
     weight[[0, -1]] = 0.5
-    declination, hour, weight = (each.ravel() for each in (*grid, weight))
+    declination, hour, weight = (item.ravel() for item in (*grid, weight))
     suns = sun_at(declination, hour, np.radians(plant.site.latitude_deg))
     up = suns[:, 2] > np.sin(LOWEST)
     clear = optics.dni * 0.7 ** (1.0 / suns[up, 2]) ** 0.678

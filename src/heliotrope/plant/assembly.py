@@ -400,7 +400,7 @@ class PlantAssembly:
         return dict(found.most_common()), seconds
 
     def left(self) -> str:
-        """Return the heliostats that are not stowed, in words; "" if all are stowed."""
+        """Return the heliostats that are not stowed, in words; empty if all are stowed."""
         rows, now = self.plant.field, self.clock.monotonic()
         away = np.flatnonzero(~(rows.live(now) & at_stow(rows.rows)))
         if not len(away):

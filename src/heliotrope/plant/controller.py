@@ -856,7 +856,7 @@ class PlantController:
             yield
 
     def misled(self, heliostat: str, point: FloatArray) -> str | None:
-        """Return why unverified parameters block a path to a point (3,); None if they do not."""
+        """Return the reason why unverified parameters block a path to a point (3,), or None."""
         return self._proofs.misled(heliostat, point)
 
     def _unwritable(self, heliostat: str) -> str | None:
@@ -916,7 +916,7 @@ class PlantController:
 
 
 def _expected(settings: PlantSettings) -> str:
-    """Return the checksum that clusters should report; "" if none is configured."""
+    """Return the checksum that clusters should report; empty if none is configured."""
     return "" if settings.common is None else settings_checksum(settings.common)
 
 

@@ -170,7 +170,7 @@ class Database:
             ) from None
 
     def revision(self) -> str:
-        """Return the revision of the tables; "" if there are no tables.
+        """Return the revision of the tables; empty if there are no tables.
 
         Raises
         ------

@@ -116,12 +116,12 @@ class Keeper:
 
     @property
     def problem(self) -> str:
-        """Why records cannot be written now; "" if they can."""
+        """Why records cannot be written now; empty if they can."""
         return self.writer.problem or self.writer.crowded
 
     @property
     def refused(self) -> str:
-        """The last record that the database rejected because of its content; "" if none was."""
+        """The last record that the database rejected because of its content; empty if none was."""
         return self.writer.refused
 
     @property

@@ -48,7 +48,7 @@ class KeptSightings:
     sightings
         The sightings in order of time.
     kinds, targets, campaigns
-        One word per sighting, (M,); "" if not set.
+        One word per sighting, (M,); empty if not set.
     """
 
     identities: Identities
@@ -85,7 +85,7 @@ class Event:
     severity
         One of `SEVERITIES`.
     heliostat
-        Heliostat concerned; "" if there is none.
+        Heliostat concerned; empty if there is none.
     values
         Numeric details by name.
     number
@@ -114,7 +114,7 @@ class AlarmEntry:
     raised, cleared, acknowledged
         Times, POSIX s; None if this has not happened yet.
     acknowledged_by
-        Operator who acknowledged it; "" if not acknowledged.
+        Operator who acknowledged it; empty if not acknowledged.
     number
         Number that always increases.
     """
@@ -218,7 +218,7 @@ class VisitEntry:
     version
         Version of the resulting calibration; 0 if there is none.
     campaign
-        Name of its campaign; "" if there is none.
+        Name of its campaign; empty if there is none.
     number
         Number that always increases; 0 before the entry is recorded.
     """
@@ -516,12 +516,12 @@ class Records(Protocol):
 
     @property
     def problem(self) -> str:
-        """Why records cannot be written now, as the text of an alarm; "" if they can."""
+        """Why records cannot be written now, as the text of an alarm; empty if they can."""
         ...
 
     @property
     def refused(self) -> str:
-        """The last record rejected because of its content; "" if there is none."""
+        """The last record rejected because of its content; empty if there is none."""
         ...
 
     @property

@@ -149,7 +149,7 @@ class Telemetry:
         self._states = pa.array(words, pa.string())
         self._last: Look | None = None
         self._looked_at = self._keyed_at = -np.inf
-        #: Why the archive cannot be written now, "" if it can.
+        #: Why the archive cannot be written now, empty if it can.
         self.problem = ""
         self._lost = False
         self._segment: _Segment | None = None

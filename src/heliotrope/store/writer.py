@@ -71,7 +71,7 @@ class Writer:
         self._attempt = threading.Lock()
         self._connection: Connection | None = None
         self._closing = self._hasty = False
-        #: Why nothing can be written now, "" if it can.
+        #: Why nothing can be written now, empty if it can.
         self.problem = ""
         #: The last job that was dropped, and the number dropped so far.
         self.refused, self.refused_count = "", 0

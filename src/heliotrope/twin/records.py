@@ -212,7 +212,7 @@ class EmergencyDisk:
         self._document = ""
 
     def emergency(self) -> str:
-        """Return the stored document; "" if there is none."""
+        """Return the stored document; empty if there is none."""
         return self._document
 
     def keep_emergency(self, document: str) -> None:

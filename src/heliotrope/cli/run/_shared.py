@@ -361,7 +361,7 @@ class Entry:
     Attributes
     ----------
     password
-        Text that says how to find the account's new password; "" if there is none.
+        Text that says how to find the account's new password; empty if there is none.
     by_link
         Whether the user signs in through a one-time link.
     """
@@ -519,7 +519,7 @@ def _mirrors(run: Running) -> str:
 
 
 def pace(rate: float) -> str:
-    """Return the pace of simulated time in words; "" if it is the pace of real time."""
+    """Return the pace of simulated time in words; empty if it is the pace of real time."""
     return "" if abs(rate - 1.0) < _SLOWER else f"simulated at {rate:.2g} × real time"
 
 

@@ -58,7 +58,7 @@ class FileRecord:
     Attributes
     ----------
     etag, modified
-        ETag and Last-Modified headers; "" if missing.
+        ETag and Last-Modified headers; empty if missing.
     size
         Size of the whole file, bytes; −1 if unknown.
     done

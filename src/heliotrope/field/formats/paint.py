@@ -66,7 +66,7 @@ class Properties:
         Centres and half edges of the facets in the mirror's frame, each (F, 3); empty if the file
         contains none.
     renovation
-        Date of the last renovation; "" if unknown.
+        Date of the last renovation; empty if unknown.
     """
 
     name: str
@@ -296,7 +296,7 @@ def find_properties(folder: str | Path) -> list[Path]:
 
 
 def heliostat_of(file: Path) -> str:
-    """Return the heliostat of a PAINT or ARTIST file, known from its folder; "" if unknown."""
+    """Return the heliostat of a PAINT or ARTIST file, known from its folder; empty if unknown."""
     if file.parent.name in ("Properties", "Calibration"):
         return file.parent.parent.name
     own = (file.parent / "heliostat-properties.json").exists()

@@ -55,7 +55,7 @@ class Edited:
     warnings
         Warnings about the changed file that did not apply to the old file.
     version
-        Stored version of the file before the change; "" if nothing was written.
+        Stored version of the file before the change; empty if nothing was written.
     """
 
     changes: tuple[Change, ...]

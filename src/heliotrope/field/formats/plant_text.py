@@ -59,7 +59,7 @@ class Difference:
     table
         Name of the table, such as ``cameras``.
     name
-        Name of the object in the table; "" if its objects have no names.
+        Name of the object in the table; empty if its objects have no names.
     how
         "changed", "new" or "removed".
     keys
@@ -138,8 +138,8 @@ def try_text(path: str | Path, text: str, used: str) -> TriedText:
             document = read_toml(trial, "a plant file")
         except FormatError as error:
             line = _AT_LINE.search(error.problem)
-            found = TextFinding("error", error.problem, int(line[1]) if line else 0)
-            return TriedText((found,), difference, ())
+            result = TextFinding("error", error.problem, int(line[1]) if line else 0)
+            return TriedText((result,), difference, ())
         allowed = set(_strings(_document(present))) | set(_strings(_document(used)))
         outside = tuple(_outside(document, allowed, text))
         if outside:
@@ -148,11 +148,11 @@ def try_text(path: str | Path, text: str, used: str) -> TriedText:
         findings, plant = examine_plant(trial)
         said = tuple(
             TextFinding(
-                one.severity,
-                one.text.replace(f"{trial}: ", "").replace(f"{folder}/", ""),
-                line_of(text, one.where),
+                item.severity,
+                item.text.replace(f"{trial}: ", "").replace(f"{folder}/", ""),
+                line_of(text, item.where),
             )
-            for one in findings
+            for item in findings
         )
     cameras, targets = ((), ()) if plant is None else (plant.cameras, plant.targets)
     return TriedText(said, difference, differing(_document(used), document), cameras, targets)
@@ -240,14 +240,14 @@ def _difference(old: str, new: str) -> tuple[str, ...]:
 
 def differing(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[Difference, ...]:
     """Return the tables in which two documents of plant files differ."""
-    found: list[Difference] = []
+    result: list[Difference] = []
     for table in dict.fromkeys((*old, *new)):
         before, after = old.get(table), new.get(table)
         if before != after:
             parts = _parts(table, before), _parts(table, after)
             inner = [] if None in parts else list(_compared(table, *map(dict, parts)))  # type: ignore[arg-type]
-            found += inner or [_one(table, "", before, after)]
-    return tuple(found)
+            result += inner or [_one(table, "", before, after)]
+    return tuple(result)
 
 
 def _parts(table: str, value: Any) -> dict[str, Any] | None:
@@ -258,7 +258,7 @@ def _parts(table: str, value: Any) -> dict[str, Any] | None:
         return value
     if table not in _NAMED or not isinstance(value, list):
         return None
-    named = {str(one.get("name")): one for one in value if isinstance(one, dict)}
+    named = {str(item.get("name")): item for item in value if isinstance(item, dict)}
     return named if len(named) == len(value) else None
 
 
@@ -289,19 +289,19 @@ def line_of(text: str, where: str) -> int:
 
     If a key has no line of its own, it is the line of the innermost table that contains it.
     """
-    wanted = re.findall(r"[^.\[\]]+", where)
+    desired = re.findall(r"[^.\[\]]+", where)
     best, line = 0, 0
     table: list[str] = []
     counts: dict[tuple[str, ...], int] = {}
     for number, row in enumerate(text.split("\n"), 1):
         if header := _HEADER.match(row):
-            found = table = _numbered(_keys(header[2]), header[1] == "[[", counts)
+            result = table = _numbered(_keys(header[2]), header[1] == "[[", counts)
         elif key := _KEY.match(row):
-            found = [*table, *_keys(key[1])]
+            result = [*table, *_keys(key[1])]
         else:
             continue
-        if len(found) > best and wanted[: len(found)] == found:
-            best, line = len(found), number
+        if len(result) > best and desired[: len(result)] == result:
+            best, line = len(result), number
     return line
 
 
@@ -311,12 +311,12 @@ def _keys(dotted: str) -> list[str]:
 
 def _numbered(parts: list[str], many: bool, counts: dict[tuple[str, ...], int]) -> list[str]:
     """Return the path of a table, with the numbers of the tables in arrays."""
-    found: list[str] = []
+    result: list[str] = []
     for k, part in enumerate(parts):
-        found.append(part)
-        key = tuple(found)
+        result.append(part)
+        key = tuple(result)
         if many and k == len(parts) - 1:
             counts[key] = counts.get(key, -1) + 1
         if key in counts:
-            found.append(str(counts[key]))
-    return found
+            result.append(str(counts[key]))
+    return result

@@ -272,7 +272,7 @@ class _Face:
         return replace(settled, view=None, text=text) if text else settled
 
     def _elsewhere(self, attempt: Attempt, view: FaceView) -> str:
-        """Return the reason why the view may show a different target; "" if it cannot."""
+        """Return the reason why the view may show a different target; empty if it cannot."""
         search = self.search
         marks, plane, targets = search.marks, search.plane, search.face.targets
         near = 0.05 * search.extent
@@ -408,7 +408,7 @@ def _rank(attempt: Attempt) -> tuple[bool, int]:
 
 
 def turn_of(observed: FloatArray, expected: FloatArray, camera: Camera, look: FrameSearch) -> str:
-    """Return how the frame is turned, as the observed marks show; "" if it is not turned.
+    """Return how the frame is turned, as the observed marks show; empty if it is not turned.
 
     Marks are compared as sets, because in a turned frame a mark may look like a different mark.
 

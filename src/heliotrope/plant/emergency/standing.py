@@ -63,7 +63,7 @@ class Standing:
     Attributes
     ----------
     act
-        Name of the field-wide order, "DEFOCUS" or "STOW"; "" if no emergency is active.
+        Name of the field-wide order, "DEFOCUS" or "STOW"; empty if no emergency is active.
     who, reason
         The person or part of the plant that gave the order, and why.
     calls

@@ -308,7 +308,7 @@ class TableWatch:
         )
 
     def night(self) -> str | None:
-        """Return why the field rests at stow although nothing is wrong; None by day."""
+        """Return the reason why the field rests at stow although nothing is wrong; None by day."""
         return next((a.text for a in self.actions if a.condition == NIGHT), None)
 
     def off(self) -> dict[str, tuple[Act, str]]:
@@ -349,7 +349,7 @@ class TableWatch:
     def withdrawn(self) -> str:
         """Return how an emergency ends whose orders have all been withdrawn.
 
-        Returns "" if there is no such emergency.
+        Returns an empty text if there is no such emergency.
 
         This concerns emergencies that operators ordered.
         """

@@ -41,7 +41,7 @@ class SecondPlant(Part):
             self._tell(alarms.SECOND_PLANT.ended())
 
     def refusal(self, clusters: Iterable[str]) -> str | None:
-        """Return why clusters accept no motion from this plant; None if they accept motion."""
+        """Return the reason why clusters accept no motion from this plant, or None."""
         lost = sorted(set(clusters) & self._lost.keys())
         if not lost:
             return None

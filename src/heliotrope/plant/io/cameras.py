@@ -94,7 +94,7 @@ class Feed:
     newest
         The last frame; None before the first frame.
     problem
-        Why no frame arrives; "" if nothing is wrong.
+        Why no frame arrives; empty if nothing is wrong.
     """
 
     def __init__(self, source: Source) -> None:

@@ -159,7 +159,7 @@ class ReceiverFlux:
     async def _read(self, found: Readings) -> str | None:
         """Take a reading; return why there is none.
 
-        Returns "" if there is a reading, and None if the frame is not new.
+        Returns an empty text if there is a reading, and None if the frame is not new.
         """
         frame, who = self._newest(), f"camera {self._eye.name}"
         made = dated(frame, self._eye)

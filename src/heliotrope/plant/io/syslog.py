@@ -124,7 +124,7 @@ class Syslog:
     lost
         Number of messages for which there was no room in the queue.
     problem
-        Why messages cannot be sent now; "" if they can.
+        Why messages cannot be sent now; empty if they can.
     """
 
     def __init__(self, receiver: Receiver, now: Callable[[], float], most: int = _WAITING) -> None:

@@ -242,7 +242,7 @@ class PathProofs:
         return before, tables_with(items, *before) if POSE_ITEMS.intersection(items) else before
 
     def resting(self, heliostat: str, items: Mapping[str, bytes]) -> str | None:
-        """Return why a heliostat may not rest at the stow position in ``items``."""
+        """Return the reason why a heliostat may not rest at the stow position in ``items``."""
         if "stow" not in items:
             return None
         counts = np.array([struct.unpack(CODES_OF["stow"], items["stow"])], dtype=np.float64)
@@ -252,7 +252,7 @@ class PathProofs:
         return blocked.get(heliostat)
 
     def rewriting(self, heliostat: str, armature: FloatArray, drives: FloatArray) -> str | None:
-        """Return why new parameters may not be written in this pose; None if they may.
+        """Return the reason why new parameters may not be written in this pose; None if they may.
 
         Under both the present and the new parameters, the beam must be clear in the present pose
         and on the path from there to the standby point. Under the present parameters it must also

@@ -106,7 +106,7 @@ class AimsView:
     moved, moved_ago
         Number of heliostats in the last move, and time since that move, s.
     problem
-        Why there are no new aims; "" if there are new aims.
+        Why there are no new aims; empty if there are new aims.
     """
 
     strategy: str

@@ -336,7 +336,7 @@ class Approvals:
         return self._courses[number].change
 
     def _over(self, change: WaitingChange) -> str:
-        """Return why a change can no longer wait; "" if it can."""
+        """Return the reason why a change can no longer wait; empty if it can."""
         if self._now() >= change.until:
             return f"nobody approved it by {_utc(change.until)}"
         if (version := self._version(change.heliostat)) != change.based_on:

@@ -410,7 +410,7 @@ class AutomaticControl:
     def _up_step(self, name: str, state: int, age: float, waits: str, *, able: bool) -> Step:
         """Return the step of a heliostat that automatic control may move.
 
-        ``waits`` is what the heliostat waits for, apart from its turn; "" if for nothing.
+        ``waits`` is what the heliostat waits for, apart from its turn; empty if for nothing.
         """
         shown = self._plant.field.of(name, self._plant.now())
         if not shown.live:
@@ -482,12 +482,12 @@ class AutomaticControl:
 
     @property
     def waits(self) -> str:
-        """Why automatic control waits for an operator's Resume; "" if it does not wait."""
+        """Why automatic control waits for an operator's Resume; empty if it does not wait."""
         return self._losses.reason
 
     @property
     def to_resume(self) -> str:
-        """What an operator's Resume would do; "" if nothing waits for a Resume."""
+        """What an operator's Resume would do; empty if nothing waits for a Resume."""
         left = 0 if self._plant.sentinel.on else int(self._raising.left.sum())
         after = f"The emergency is over: {left:,} heliostats wait until an operator presses Resume."
         return self.waits or (after if left else "")
@@ -549,7 +549,7 @@ class AutomaticControl:
 
     @property
     def idle(self) -> str:
-        """Why nothing is moved now; "" if heliostats may be moved."""
+        """Why nothing is moved now; empty if heliostats may be moved."""
         return self._why_idle() or ""
 
     @property
@@ -656,7 +656,7 @@ class AutomaticControl:
         return grant is not None and grant.holder == AUTOMATIC and grant.token == self._token
 
     def _why_not(self) -> str | None:
-        """Return why nothing is calibrated now; None if calibration may run."""
+        """Return the reason why nothing is calibrated now; None if calibration may run."""
         if self._calibrating is None:
             return "there is no camera"
         if not self._on:
@@ -664,7 +664,7 @@ class AutomaticControl:
         return self._why_idle()
 
     def _why_idle(self) -> str | None:
-        """Return why nothing is moved now; None if heliostats may be moved."""
+        """Return the reason why nothing is moved now; None if heliostats may be moved."""
         if self._plant.sentinel.on:
             return "an emergency is active"
         if self.waits:

@@ -230,7 +230,7 @@ class Calibrating:
 
     @property
     def receiver(self) -> str:
-        """Name of the receiver on which heliostats are measured; "" if there is none."""
+        """Name of the receiver on which heliostats are measured; empty if there is none."""
         return "" if self._receiver is None else self._receiver.surface
 
     def ask_together(self, heliostats: Sequence[str], surface: str) -> None:
@@ -452,7 +452,7 @@ class Calibrating:
     def _note_place(self, place: str, problem: str, token: int) -> None:
         """Record why a visit to a place failed through no fault of a heliostat.
 
-        ``problem`` is "" if the visit did not fail in this way.
+        ``problem`` is empty if the visit did not fail in this way.
         """
         if not problem:
             self._places.done(place)

@@ -27,7 +27,7 @@ def explain(
     name
         Heliostat.
     on
-        Receiver or target at which the heliostat aims; "" if there is none.
+        Receiver or target at which the heliostat aims; empty if there is none.
 
     Raises
     ------

@@ -57,7 +57,7 @@ class Keeping:
     Attributes
     ----------
     lost
-        The last failure to keep a record; "" if the last attempt succeeded.
+        The last failure to keep a record; empty if the last attempt succeeded.
     """
 
     def __init__(self, names: Sequence[str], beliefs: Beliefs, records: Records | None) -> None:
@@ -67,7 +67,7 @@ class Keeping:
 
     @property
     def problem(self) -> str:
-        """Why records cannot be kept now; "" if they can."""
+        """Why records cannot be kept now; empty if they can."""
         return self.lost or (self._records.problem if self._records is not None else "")
 
     def recall(self) -> None:

@@ -47,7 +47,7 @@ class Losses:
     Attributes
     ----------
     reason
-        Why automatic control waits for an operator; "" if it does not wait.
+        Why automatic control waits for an operator; empty if it does not wait.
     """
 
     def __init__(

@@ -248,9 +248,9 @@ class Marking:
         """Return the views of the changed cameras and targets of a new plant file."""
         changed = {camera.name for camera in cameras}
         marked = {surface.name for surface in surfaces}
-        seen = [t.name for t in self._own.targets if self.sees(t.name)]
+        known = [t.name for t in self._own.targets if self.sees(t.name)]
         targets = frozenset(
-            name for name in seen if name in marked or self._cameras.eye(name).name in changed
+            name for name in known if name in marked or self._cameras.eye(name).name in changed
         )
         return NewViews(tuple(cameras), tuple(surfaces), targets, {})
 

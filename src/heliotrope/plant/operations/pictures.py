@@ -120,7 +120,7 @@ class Pictures:
     Attributes
     ----------
     problem
-        Why the last picture could not be stored; "" if it was stored.
+        Why the last picture could not be stored; empty if it was stored.
     """
 
     def __init__(

@@ -84,7 +84,7 @@ class PlantFileView:
     differs
         Tables that differ from the text in use, which take effect when the plant restarts.
     problem
-        Why the present file cannot be used; "" if it can.
+        Why the present file cannot be used; empty if it can.
     approval
         Whether a new text needs the approval of a second engineer.
     waiting
@@ -133,7 +133,7 @@ class PlantFileCheck:
 class PlantFileStored:
     """A stored text: what follows, in words, and the version that it replaced.
 
-    The version is "" if nothing is written until a second engineer has approved the text.
+    The version is empty if nothing is written until a second engineer has approved the text.
     """
 
     text: str
@@ -247,7 +247,7 @@ class PlantFile:
             problem,
             self._settings.parameters,
             waiting,
-            tuple(StoredVersion(one.name, one.note) for one in reversed(kept[-_LISTED:])),
+            tuple(StoredVersion(item.name, item.note) for item in reversed(kept[-_LISTED:])),
         )
 
     async def stored(self, person: Person, version: str) -> str:
@@ -263,7 +263,7 @@ class PlantFile:
         person.must_be(Role.ENGINEER, "plant file")
         file = self._own()
         kept = await asyncio.to_thread(plant_edit.versions, file)
-        names = [one.name for one in reversed(kept)]
+        names = [item.name for item in reversed(kept)]
         if version not in names:
             raise UnknownNameError("stored version", version, names)
         place = plant_edit.version_folder(file, version) / file.name
@@ -429,12 +429,12 @@ class PlantFile:
         writing = asyncio.ensure_future(
             asyncio.to_thread(store_text, file, text, change, now=self._plant.clock.utc())
         )
-        left: asyncio.CancelledError | None = None
+        rest: asyncio.CancelledError | None = None
         try:
             try:
                 version = await asyncio.shield(writing)
             except asyncio.CancelledError as error:
-                left, version = error, await writing
+                rest, version = error, await writing
         except (OSError, InputError) as error:
             raise InputError(
                 f"plant file: {file} cannot be written ({getattr(error, 'strerror', '') or error}),"
@@ -447,13 +447,13 @@ class PlantFile:
             self._used = text.replace("\r\n", "\n")
         said = f"plant file stored, {at}: {tables}"
         self._log.event("command", person.name, f"{said} ({reason}{f'; by {by}' * bool(author)})")
-        if left is not None:
-            raise left
+        if rest is not None:
+            raise rest
         return PlantFileStored(said, version)
 
     def _at_once(self, tried: TriedText) -> bool:
         """Whether all differences concern only the evaluation of later photographs."""
-        return all(self._only_seen(one, tried) for one in tried.differs)
+        return all(self._only_seen(item, tried) for item in tried.differs)
 
     def _only_seen(self, one: Difference, tried: TriedText) -> bool:
         if self._marking is None or one.how != "changed":

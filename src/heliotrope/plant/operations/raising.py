@@ -154,7 +154,7 @@ class Raising:
         return resting
 
     def why_not(self, heliostat: str) -> str | None:
-        """Return why a heliostat is not raised; None if it is raised or waits for its turn."""
+        """Return the reason why a heliostat is neither raised nor next in turn, or None."""
         if why := self._plant.drive_checks.stalled.get(heliostat):
             return f"{why}: see the alarm {alarms.DRIVE_STALLED.name}"
         if heliostat in self._blocked:

@@ -81,7 +81,7 @@ class Service:
         return found
 
     def closed(self, target: str) -> str | None:
-        """Return why no beam may be sent to a target; None if beams may be sent."""
+        """Return the reason why no beam may be sent to a target; None if beams may be sent."""
         locks = self._plant.lockouts
         return locks.text(Kind.TARGET, target) or locks.text(Kind.TOWER, TOWER) or None
 

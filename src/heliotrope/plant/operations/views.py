@@ -135,7 +135,7 @@ class HeliostatView:
     aim, standby
         ENU, m, (3,); NaN if not assigned.
     on
-        Receiver or target at which the heliostat aims; "" if there is none.
+        Receiver or target at which the heliostat aims; empty if there is none.
     parameters
         Parameters of its mechanism, by name.
     calibration
@@ -151,9 +151,9 @@ class HeliostatView:
     planned
         Its next visit, if one is planned.
     hold
-        Why it is out of service, who took it out, and when it is expected back; "" if it is not.
+        Why it is out of service, who took it out, and when it is expected back; empty if it is not.
     locked
-        Why it is LOCKED, by which visit, since when and until when; "" if it is not.
+        Why it is LOCKED, by which visit, since when and until when; empty if it is not.
     """
 
     name: str
@@ -210,13 +210,13 @@ class ClusterRow:
     time_quality, time_error
         Quality of its clock, and the error bound, s.
     settings
-        Checksum of the settings that all clusters should share; "" if unknown.
+        Checksum of the settings that all clusters should share; empty if unknown.
     lease_left
         Remaining lease at its last status, s; NaN if unknown.
     acts
         Actions that its safety table demands.
     problem
-        Problem with its link; "" if there is none.
+        Problem with its link; empty if there is none.
     """
 
     name: str
@@ -245,7 +245,7 @@ class AlarmRow(Alarm):
     at
         When it was raised, POSIX s.
     acknowledged_by
-        Person who has acknowledged the alarm; "" if nobody has.
+        Person who has acknowledged the alarm; empty if nobody has.
     count
         Number of times it was raised.
     """
@@ -328,7 +328,7 @@ class BusFrame:
     way
         "sent" or "received" by the cluster.
     whom
-        The heliostat at the other end, or "all"; "" if the frame is damaged.
+        The heliostat at the other end, or "all"; empty if the frame is damaged.
     kind, sequence
         Name of the message, or "damaged"; its sequence number.
     size
@@ -552,7 +552,7 @@ class PictureRow:
     identity
         Number of the photograph.
     heliostat, target
-        Names; heliostat "" if a user requested the photograph.
+        Names; heliostat empty if a user requested the photograph.
     at
         Mid-exposure time, POSIX s, which is also the time of its sighting.
     used
@@ -714,7 +714,7 @@ class EmergencyView:
     act, who, reason
         DEFOCUS or STOW; the users whose orders are in force, and the safety table if it requires
         the order; and the reason, or how the emergency ends once every order is withdrawn. After
-        the emergency: who gave the order, and why. "" if there was no order.
+        the emergency: who gave the order, and why; empty if there was no order.
     seconds
         Time since the order, s.
     heliostats, acknowledged, done
@@ -773,7 +773,7 @@ class Summary:
     clusters_alive
         Number of clusters that report.
     holder, role
-        User with the command authority; "" if nobody has it.
+        User with the command authority; empty if nobody has it.
     waiting
         Number of heliostats waiting to join the receiver.
     alarms
@@ -781,7 +781,7 @@ class Summary:
     emergency
         Whether an emergency is active.
     resume
-        Why automatic control waits for an operator's Resume; "" if it does not wait.
+        Why automatic control waits for an operator's Resume; empty if it does not wait.
     pace
         Seconds of plant time per second over the last half minute: 1 for a real plant.
     readings

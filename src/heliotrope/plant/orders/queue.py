@@ -117,7 +117,7 @@ class PlantOrders(Part):
     confirmed_at
         Last time that the audit log confirmed that it can write, monotonic s.
     problem
-        Why the audit log cannot write; "" if it can.
+        Why the audit log cannot write; empty if it can.
     latest
         Ticket of the last command; None before the first.
     last

@@ -66,7 +66,7 @@ class JudgedFit:
         A fit that follows the drift need not explain the past, so only the last day's photographs
         are used.
     outcome, problem
-        Verdict on the fit, and why it is rejected ("" if it is not rejected).
+        Verdict on the fit, and why it is rejected (empty if it is not rejected).
     name
         Name of the heliostat.
     flown

@@ -129,7 +129,7 @@ def _darkened(
 def _unknown(
     plant: PlantController, name: str, error: float, settings: JointSettings
 ) -> str | None:
-    """Return why the expected error of a beam is too large; None if it is not."""
+    """Return the reason why the expected error of a beam is too large; None if it is not."""
     if plant.beliefs.record(name) is None:
         return "it has no calibration yet; it is calibrated alone first"
     if error > settings.known:

@@ -242,7 +242,7 @@ class Centred:
         return aim
 
     def _astray(self, target: Target, shot: Shot, aim: FloatArray, light: "_Light") -> str | None:
-        """Return why light cannot be the beam: it does not move with the aim."""
+        """Return the reason why light cannot be the beam: it does not move with the aim."""
         place = seen(target, shot)
         if place is None:
             return None if shot.reasons else "no light on the target"

@@ -42,7 +42,7 @@ class Confirming(Protocol):
     async def __call__(
         self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
     ) -> str | None:
-        """Return why the parameters are not confirmed; see `Verification.problem`."""
+        """Return the reason why the parameters are not confirmed; see `Verification.problem`."""
         ...
 
 
@@ -124,13 +124,13 @@ class Verification:
     def judge(
         self, nominal: Mechanism, fitted: FieldFit, shot: Shot, counts: FloatArray
     ) -> str | None:
-        """Return why a shot, with its step counts, does not confirm a fit."""
+        """Return the reason why a shot, with its step counts, does not confirm a fit."""
         return self._judge(nominal, fitted, self._sighting(shot, counts))
 
     async def problem(
         self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
     ) -> str | None:
-        """Return why the new parameters are not confirmed; None if they are.
+        """Return the reason why the new parameters are not confirmed; None if they are.
 
         The heliostat already stores the new parameters. It is at standby before and after.
 

@@ -26,7 +26,7 @@ class Station(Protocol):
     """A device connected to a bus."""
 
     def hear(self, data: bytes, now: float) -> bytes:
-        """Receive bytes at a time in s; return the immediate reply, b"" if there is none."""
+        """Receive bytes at a time in s; return the immediate reply, empty if there is none."""
         ...
 
 
@@ -196,7 +196,7 @@ class TwinBus:
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return the reply; b"" if none arrives in time.
+        """Send a frame and return the reply; empty if none arrives in time.
 
         Raises
         ------

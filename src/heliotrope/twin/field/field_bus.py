@@ -163,7 +163,7 @@ class FieldBus:
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return the reply; b"" if there is none."""
+        """Send a frame and return the reply; empty if there is none."""
         del timeout, expires, complete
         if urgent:
             # In an emergency all buses and the plant take turns.
@@ -266,7 +266,7 @@ class FieldBus:
         return self._status_payloads
 
     def _answer(self, place: int, sequence: int, name: str, payload: bytes) -> bytes:
-        """Return a heliostat's reply frame; b"" if the heliostat has no power."""
+        """Return a heliostat's reply frame; empty if the heliostat has no power."""
         if self._field.state[self._rows[place]] < 0:
             return b""
         head = _HEADER.pack(wire.VERSION, wire.CLUSTER_ADDRESS, place + 1, sequence, _NUMBERS[name])
@@ -313,7 +313,7 @@ class FieldBus:
 
 
 def _unstuffed(data: bytes) -> bytes:
-    """Return the payload of stuffed bytes, the inverse of `_stuffed`; b"" if they are invalid."""
+    """Return the payload of stuffed bytes, the inverse of `_stuffed`; empty if they are invalid."""
     if data.find(0) != len(data) - 1:
         return b""
     out, place, end = bytearray(data), 0, len(data) - 1

@@ -156,7 +156,7 @@ class Acts:
         commands
             Function that is called each second with a probability of one fifth.
         reason
-            Reason for seizing the authority from its holder; "" if it is taken only when free.
+            Reason for seizing the authority from its holder; empty if it is taken only when free.
         leaves
             Whether the operator leaves without releasing the authority, so that it expires.
         """

@@ -51,7 +51,7 @@ class Intruder:
         self._addresses = addresses
 
     def recorded(self, size: float) -> bytes:
-        """Return an earlier frame, chosen by ``size`` (0 to 1); b"" if none was recorded.
+        """Return an earlier frame, chosen by ``size`` (0 to 1); empty if none was recorded.
 
         Half of the frames chosen are recent commands, which may not have expired yet.
         """
