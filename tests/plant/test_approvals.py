@@ -45,10 +45,11 @@ class Kept:
     def calibration_history(self, heliostat: str) -> list[HeliostatCalibration]:
         return [one for one in self.versions if one.heliostat == heliostat]
 
-    def waiting_changes(self) -> str:
+    def waiting_changes(self, kind: str) -> str:
+        assert kind == "parameters"
         return self.document
 
-    def keep_waiting_changes(self, document: str) -> None:
+    def keep_waiting_changes(self, kind: str, document: str) -> None:
         self.document = document
 
     def event(self, kind: str, who: str, text: str) -> None:

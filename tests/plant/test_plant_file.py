@@ -87,10 +87,11 @@ class Scene:
         )
         self.here.recall()
 
-    def waiting_plant_file(self) -> str:
+    def waiting_changes(self, kind: str) -> str:
+        assert kind == "plant file"
         return self.document
 
-    def keep_waiting_plant_file(self, document: str) -> None:
+    def keep_waiting_changes(self, kind: str, document: str) -> None:
         self.document = document
 
     def command(self, person: Person) -> None:
@@ -257,7 +258,7 @@ def test_where_the_file_asks_for_it_a_second_engineer_approves(tmp_path: Path) -
     assert scene.view().waiting is None
     scene.store(text)
     assert scene.file.read_text() == scene.text
-    with pytest.raises(InputError, match=r"change \d+ of engineer is waiting"):
+    with pytest.raises(RefusedError, match=r"change \d+ of engineer is waiting"):
         scene.store(TARGET, SECOND)
     scene.begin()  # it outlives a restart
     number = scene.view().waiting.number
@@ -290,7 +291,7 @@ def test_a_waiting_text_is_refused_or_lapses_and_never_overwrites(tmp_path: Path
     scene.seconds += 28_801.0
     scene.here.step()
     assert scene.view().waiting is None
-    assert "nobody approved it in time" in scene.told[-1]
+    assert "nobody approved it by" in scene.told[-1]
     assert scene.file.read_text() == scene.text + "# surveyed\n"
 
 

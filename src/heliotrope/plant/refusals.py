@@ -122,26 +122,27 @@ REASON_MISSING = Refusal(
 SECOND_PERSON = Refusal(
     "second engineer needed",
     "The author of a change tries to approve or refuse it.",
-    "change {number} of {heliostat}: {person} requested it, so another engineer must decide",
+    "change {number}, {subject}: {person} requested it, so another engineer must decide",
     "Ask another engineer with an account of their own, or withdraw the change.",
 )
 NOT_AUTHOR = Refusal(
     "not the author",
     "A user tries to withdraw a change that another user requested.",
-    "change {number} of {heliostat}: {author} requested it, so {person} can only refuse it",
+    "change {number}, {subject}: {author} requested it, so {person} can only refuse it",
     "Refuse it with a reason, or ask its author to withdraw it.",
 )
 CHANGE_WAITS = Refusal(
     "change waits",
-    "Another change of the same heliostat's parameters is waiting for approval.",
-    "parameters {heliostat}: change {number} of {author} is waiting for approval, so no new change "
+    "Another change of the same heliostat's parameters, or of the plant file, is waiting for "
+    "approval.",
+    "{subject}: change {number} of {author} is waiting for approval, so no new change "
     "was requested",
     "Have that change approved, refused or withdrawn first.",
 )
 CHANGE_OVERTAKEN = Refusal(
     "change overtaken",
     "The time limit for approval has passed, or the heliostat has received new parameters since.",
-    "change {number} of {heliostat}: {reason}, so it is no longer valid",
+    "change {number}, {subject}: {reason}, so it is no longer valid",
     "Compare the versions, and request the change again if it is still right.",
 )
 NOT_NOW = Refusal(

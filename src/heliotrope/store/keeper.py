@@ -64,10 +64,8 @@ _READERS = 4
 _LIMITS = "safety limits"
 #: Name of the document about the active emergency.
 _EMERGENCY = "emergency"
-#: Name of the document about changes that await approval.
-_CHANGES = "waiting changes"
-#: Name of the document about a plant file that awaits approval.
-_PLANT_FILE = "waiting plant file"
+#: Names of the documents about changes that await approval, by kind.
+_CHANGES = {"parameters": "waiting changes", "plant file": "waiting plant file"}
 _AIMED = "aimed by people"
 
 
@@ -504,21 +502,16 @@ class Keeper:
         """Replace the document about the active emergency; an empty one means that it has ended."""
         self._keep_document(_EMERGENCY, document)
 
-    def waiting_changes(self) -> str:
-        """Return the document about changes that await approval; an empty document if none do."""
-        return self._document(_CHANGES)
+    def waiting_changes(self, kind: str) -> str:
+        """Return the document about changes of a kind that await approval; empty if none do.
 
-    def keep_waiting_changes(self, document: str) -> None:
+        The kinds are "parameters" and "plant file".
+        """
+        return self._document(_CHANGES[kind])
+
+    def keep_waiting_changes(self, kind: str, document: str) -> None:
         """Replace the document about changes that await approval; an empty one means none do."""
-        self._keep_document(_CHANGES, document)
-
-    def waiting_plant_file(self) -> str:
-        """Return the document about a plant file that awaits approval; empty if there is none."""
-        return self._document(_PLANT_FILE)
-
-    def keep_waiting_plant_file(self, document: str) -> None:
-        """Replace the document about a plant file that awaits approval."""
-        self._keep_document(_PLANT_FILE, document)
+        self._keep_document(_CHANGES[kind], document)
 
     def aimed_by_people(self) -> tuple[str, ...]:
         """Return the heliostats that operators have aimed, and that keep these aims."""

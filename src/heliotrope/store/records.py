@@ -588,20 +588,15 @@ class Records(Protocol):
         """Replace the document about the active emergency; an empty one means that it has ended."""
         ...
 
-    def waiting_changes(self) -> str:
-        """Return the document about changes that await approval; an empty document if none do."""
+    def waiting_changes(self, kind: str) -> str:
+        """Return the document about changes of a kind that await approval; empty if none do.
+
+        The kinds are "parameters" and "plant file".
+        """
         ...
 
-    def keep_waiting_changes(self, document: str) -> None:
+    def keep_waiting_changes(self, kind: str, document: str) -> None:
         """Replace the document about changes that await approval; an empty one means none do."""
-        ...
-
-    def waiting_plant_file(self) -> str:
-        """Return the document about a plant file that awaits approval; empty if there is none."""
-        ...
-
-    def keep_waiting_plant_file(self, document: str) -> None:
-        """Replace the document about a plant file that awaits approval."""
         ...
 
     def aimed_by_people(self) -> tuple[str, ...]:

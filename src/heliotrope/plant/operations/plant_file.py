@@ -8,10 +8,9 @@ restarts. A mixture is never in use.
 """
 
 import asyncio
-import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from heliotrope.errors import InputError, UnknownNameError
@@ -31,10 +30,10 @@ from heliotrope.plant import refusals
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.marking import Marking, NewViews
+from heliotrope.plant.operations.second_approval import WaitingChanges, authority_of
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.workers import Worker
-from heliotrope.safety import alarms
-from heliotrope.store.records import Records, StoreError
+from heliotrope.store.records import Records
 
 #: Keys of a camera that concern only the evaluation of its photographs.
 _VIEW_KEYS = frozenset(
@@ -42,7 +41,6 @@ _VIEW_KEYS = frozenset(
 )
 #: Number of stored versions that a view lists, the latest first.
 _LISTED = 50
-_WHAT = "the plant file"
 
 
 @dataclass(frozen=True)
@@ -149,8 +147,18 @@ class _Waiting:
     reason: str
     at: float
     until: float
-    text: str
     based_on: str
+    new_text: str
+
+    @property
+    def subject(self) -> str:
+        """What the change concerns."""
+        return "plant file"
+
+    @property
+    def text(self) -> str:
+        """The change in words."""
+        return f"PLANT FILE ({self.reason})"
 
 
 class PlantFile:
@@ -183,34 +191,21 @@ class PlantFile:
         records: Records | None,
     ) -> None:
         self._file, self._plant, self._log, self._marking = file, plant, log, marking
-        self._visited, self._worker, self._records = visited, worker, records
-        self._settings = plant.design.approval
+        self._visited, self._worker = visited, worker
         self._used = "" if file is None else plant_text(file)
-        self._waiting: _Waiting | None = None
-        self._last = 0
+        self._changes = WaitingChanges(
+            "plant file", plant, log, records, lambda document: _Waiting(**document)
+        )
         self._turn = asyncio.Lock()
 
     def recall(self) -> None:
         """Continue with the text that was waiting when the plant's program ended."""
-        if self._records is None or self._file is None:
-            return
-        try:
-            document = self._records.waiting_plant_file()
-            self._waiting = _Waiting(**json.loads(document)) if document else None
-        except StoreError as error:
-            self._log.take_alarm(alarms.RECORDS.raised(problem=error))
-        except (ValueError, TypeError) as error:
-            text = f"the plant file waiting for approval cannot be read ({error}); store it again"
-            self._log.event("command", "", text)
-        if self._waiting is not None:
-            self._last = self._waiting.number
-            if not self._settings.parameters:
-                self._end("the plant file no longer requires a second approval")
+        if self._file is not None:
+            self._changes.recall()
 
     def step(self) -> None:
         """End a waiting text that is past its deadline."""
-        if self._waiting is not None and self._now() >= self._waiting.until:
-            self._end("nobody approved it in time")
+        self._changes.step()
 
     # -- looking ---------------------------------------------------------------------------
 
@@ -225,7 +220,7 @@ class PlantFile:
             If the plant has no file, or it cannot be read.
         """
         person.must_be(Role.ENGINEER, "plant file")
-        file, waits = self._own(), self._waiting
+        file, waits = self._own(), next(iter(self._changes.all), None)
         text, kept = await asyncio.to_thread(lambda: (plant_text(file), plant_edit.versions(file)))
         problem, differs = "", tuple[Difference, ...]()
         if text != self._used:
@@ -234,7 +229,7 @@ class PlantFile:
             differs = tried.differs
         waiting = None
         if waits is not None:
-            tried = await self._worker(try_text, file, waits.text, self._used)
+            tried = await self._worker(try_text, file, waits.new_text, self._used)
             waiting = WaitingFile(
                 waits.number, waits.author, waits.reason, waits.at, waits.until, tried.difference
             )
@@ -245,7 +240,7 @@ class PlantFile:
             await asyncio.to_thread(_writable, file),
             differs,
             problem,
-            self._settings.parameters,
+            self._changes.needed,
             waiting,
             tuple(StoredVersion(item.name, item.note) for item in reversed(kept[-_LISTED:])),
         )
@@ -314,25 +309,15 @@ class PlantFile:
             raise refusals.REASON_MISSING.error(what="plant file")
         self.step()
         async with self._turn:
-            if not self._settings.parameters:
+            if not self._changes.needed:
                 return await self._write(person, "", text, based_on, reason.strip())
-            if (other := self._waiting) is not None:
-                raise InputError(
-                    f"plant file: change {other.number} of {other.author} is waiting for approval; "
-                    "have it approved, refused or withdrawn first"
-                )
             await self._tried(text, based_on)
-            now = self._now()
-            # Anyone who sees an earlier text can never approve a later one in its place.
-            self._last = max(self._last + 1, int(1e3 * now))
-            until = now + self._settings.within
-            self._waiting = _Waiting(
-                self._last, person.name, reason.strip(), now, until, text, based_on
+            number, now, until = self._changes.request()
+            change = _Waiting(number, person.name, reason.strip(), now, until, based_on, text)
+            self._changes.add(person, change)
+            return PlantFileStored(
+                f"change {number} of the plant file waits for another engineer's approval", ""
             )
-            self._keep()
-            said = f"change {self._last} of the plant file waits for another engineer's approval"
-            self._tell(person, f"{said} ({reason.strip()})")
-            return PlantFileStored(said, "")
 
     async def approve(self, person: Person, number: int) -> PlantFileStored:
         """Approve another engineer's text and store it.
@@ -345,43 +330,20 @@ class PlantFile:
             If no such text is waiting.
         """
         async with self._turn:
-            waits = self._others(person, number)
-            done = await self._write(person, waits.author, waits.text, waits.based_on, waits.reason)
-            self._waiting = None
-            self._keep()
+            waits = self._changes.others(person, number)
+            done = await self._write(
+                person, waits.author, waits.new_text, waits.based_on, waits.reason
+            )
+            self._changes.approved(person, waits)
             return done
 
     def refuse(self, person: Person, number: int, reason: str) -> None:
-        """Refuse another engineer's text, with a reason.
-
-        Raises
-        ------
-        RefusedError
-            If the person is not another engineer, or gives no reason.
-        UnknownNameError
-            If no such text is waiting.
-        """
-        self._others(person, number)
-        if not reason.strip():
-            raise refusals.REASON_MISSING.error(what=f"change {number}")
-        self._end(f"refused by {person.name}: {reason.strip()}", person)
+        """Refuse another engineer's text; see `WaitingChanges.refuse`."""
+        self._changes.refuse(person, number, reason)
 
     def withdraw(self, person: Person, number: int) -> None:
-        """Withdraw a person's own text.
-
-        Raises
-        ------
-        RefusedError
-            If another person requested it.
-        UnknownNameError
-            If no such text is waiting.
-        """
-        waits = self._find(number)
-        if person.name != waits.author:
-            raise refusals.NOT_AUTHOR.error(
-                number=number, heliostat=_WHAT, author=waits.author, person=person.name
-            )
-        self._end(f"withdrawn by {person.name}", person)
+        """Withdraw a person's own text; see `WaitingChanges.withdraw`."""
+        self._changes.withdraw(person, number)
 
     # -- parts -----------------------------------------------------------------------------
 
@@ -465,11 +427,7 @@ class PlantFile:
 
     async def _views(self, person: Person, author: str, tried: TriedText) -> NewViews:
         """Return the new views, if they may be used now."""
-        grant = self._plant.authority.grant
-        if grant is None:
-            raise refusals.NO_AUTHORITY.error(person=person.name)
-        if grant.holder.name not in (person.name, author):
-            raise refusals.OTHER_AUTHORITY.error(holder=grant.holder.name, person=person.name)
+        authority_of(self._plant, person.name, author)
         assert self._marking is not None
         changed = {table: {d.name for d in tried.differs if d.table == table}
                    for table in ("cameras", "targets")}  # fmt: skip
@@ -485,48 +443,6 @@ class PlantFile:
                 )
         pictures = await asyncio.to_thread(views.read, self._own().parent)
         return replace(views, pictures=pictures)
-
-    def _others(self, person: Person, number: int) -> _Waiting:
-        """Return another person's text on which an engineer may decide."""
-        person.must_be(Role.ENGINEER, "approval")
-        waits = self._find(number)
-        if person.name == waits.author:
-            raise refusals.SECOND_PERSON.error(number=number, heliostat=_WHAT, person=person.name)
-        return waits
-
-    def _find(self, number: int) -> _Waiting:
-        self.step()
-        if self._waiting is None or self._waiting.number != number:
-            known = [] if self._waiting is None else [str(self._waiting.number)]
-            raise UnknownNameError("waiting change of the plant file", str(number), known)
-        return self._waiting
-
-    def _end(self, why: str, person: Person | None = None) -> None:
-        waits, self._waiting = self._waiting, None
-        self._keep()
-        if waits is None:
-            return
-        text = f"change {waits.number} of {_WHAT} by {waits.author} has ended, {why}"
-        if person is None:
-            self._log.event("command", "", text)
-        else:
-            self._tell(person, text)
-
-    def _tell(self, person: Person, text: str) -> None:
-        self._plant.note(person, "PLANT FILE", text)
-        self._log.event("command", person.name, text)
-
-    def _keep(self) -> None:
-        if self._records is None:
-            return
-        document = "" if self._waiting is None else json.dumps(asdict(self._waiting))
-        try:
-            self._records.keep_waiting_plant_file(document)
-        except StoreError as error:
-            self._log.take_alarm(alarms.RECORDS.raised(problem=error))
-
-    def _now(self) -> float:
-        return self._plant.clock.utc().timestamp()
 
 
 def _line(finding: TextFinding) -> str:
