@@ -210,7 +210,7 @@ def _fleets(
 def _flown(
     plant: "Plant", fleets: "list[Fleet]", model: str, flight: tuple[int, int], quiet: bool
 ) -> "tuple[list[Fleet], dict[str, Any]]":
-    """Return the fleets after a flight; each heliostat in them stands for its whole cluster."""
+    """Return the fleets after a flight; each heliostat in them represents its whole cluster."""
     import numpy as np
 
     from heliotrope.airborne.plan import Craft, PlanSettings, PointSelection, plan_flight

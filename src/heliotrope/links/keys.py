@@ -270,7 +270,7 @@ class KeyFile:
     def end(self, names: Sequence[str]) -> list[str]:
         """Remove the old keys of some names, and return the names.
 
-        () stands for all names that have an old key.
+        () means all names that have an old key.
 
         Raises
         ------

@@ -151,7 +151,7 @@ class Belief:
         """Return parameters (P,) and their covariance (P, P) at a time in days, not in the past.
 
         The hypotheses are averaged by weight; the lightest are ignored as long as their weights sum
-        to less than `IGNORED`. NaN stands for an unknown time.
+        to less than `IGNORED`. NaN means an unknown time.
         """
         h, state, gap = self.hyper, self.layout, self.days_since(time)
         many = int(np.searchsorted(np.cumsum(self.weight), 1.0 - IGNORED)) + 1

@@ -89,7 +89,7 @@ def stages(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
 def rendered_camera(size: str, focal_px: float = 0.0) -> "LedCamera":
     """Return the camera of rendered photographs.
 
-    A focal length of 0 stands for 3/4 of the image width.
+    A focal length of 0 means 3/4 of the image width.
     """
     import numpy as np
 

@@ -271,15 +271,15 @@ class LinksFile:
     def _take_keys(self) -> None:
         """Read the key file again, and update the keys of the links."""
         path = self.path.parent / self.document.keys
-        found = _keys_of(path, self.document)
+        result = _keys_of(path, self.document)
         for name in self.keys:
-            if name not in found.members:
+            if name not in result.members:
                 raise FormatError(
                     path, "its key is missing, but the links need it", f"clusters.{name}"
                 )
         for name, ring in self.keys.items():
-            ring.keys = found.members[name]
-        self.password.word = found.password
+            ring.keys = result.members[name]
+        self.password.word = result.password
 
     def _serve(self, made: "PlantLinks", keys: Mapping[str, KeyRing], clock: Clock) -> None:
         table = self.document.tcp
@@ -364,18 +364,18 @@ class PlantLinks:
 
     def facts(self) -> dict[str, str]:
         """Return the last refused connection, and the new keys that are not in use, by name."""
-        found = {}
+        result = {}
         if self.server is not None and self.server.refused:
-            told = f"{self.server.last_refusal} ({self.server.refused} so far)"
-            found["refused link"] = told
+            message = f"{self.server.last_refusal} ({self.server.refused} so far)"
+            result["refused link"] = message
         behind = [
             name
             for name, link in self.links.items()
             if isinstance(link, CarriedLink) and link.behind
         ]
         if behind:
-            found["old key still used"] = ", ".join(behind)
-        return found
+            result["old key still used"] = ", ".join(behind)
+        return result
 
 
 def read_links(path: str | Path) -> LinksFile:
@@ -389,10 +389,10 @@ def read_links(path: str | Path) -> LinksFile:
     path = Path(path)
     document = read_document(path, "links", LinksDocument, TABLES)
     keys = _keys_of(path.parent / document.keys if document.keys else None, document)
-    rings = {name: KeyRing(*each) for name, each in keys.members.items()}
-    found = LinksFile(path, document, rings, BrokerPassword(keys.password))
-    _check(found)
-    return found
+    rings = {name: KeyRing(*item) for name, item in keys.members.items()}
+    result = LinksFile(path, document, rings, BrokerPassword(keys.password))
+    _check(result)
+    return result
 
 
 def _keys_of(path: Path | None, document: LinksDocument) -> Keys:
@@ -410,15 +410,15 @@ def _check(found: LinksFile) -> None:
                 f"there is no such reading; use one of {', '.join(sorted(FED))}",
                 f"sensors.{name}",
             )
-    seen = [name for name, how in document.sensors.items() if how == CAMERA]
-    for name in seen:
+    by_camera = [name for name, how in document.sensors.items() if how == CAMERA]
+    for name in by_camera:
         if name != FLUX_READING:
             raise FormatError(
                 path,
                 f"a camera supplies {FLUX_READING} only; name a file instead",
                 f"sensors.{name}",
             )
-    if bool(seen) != bool(document.receiver_light):
+    if bool(by_camera) != bool(document.receiver_light):
         raise FormatError(
             path,
             f'{FLUX_READING} = "camera" and receiver_light, the reference of that camera, must be '

@@ -131,10 +131,10 @@ class FlightIntake:
         """Return a flight that this plant can import."""
         person.must_be(Role.ENGINEER, "flight")
         flight, beliefs = Flight.of(document), self._plant.beliefs
-        for each in beliefs.flights:
-            if each.flight.name == flight.name:
+        for item in beliefs.flights:
+            if item.flight.name == flight.name:
                 raise refusals.FLIGHT_KNOWN.error(
-                    name=flight.name, person=each.person, at=_day(each.at)
+                    name=flight.name, person=item.person, at=_day(item.at)
                 )
         if self._busy:
             raise refusals.FLIGHT_BUSY.error(name=flight.name, other=self._busy)
@@ -214,10 +214,10 @@ class FlightIntake:
         known, beliefs.flights = tuple(beliefs.flights), Flights()
         for taken in known:
             flights = beliefs.flights.adding(taken)
-            found = fit_flights(beliefs, flights, self._settings, taken.flight.heliostats)
-            flights.leave_out([n for n, fit in found.items() if fit.outcome in WRONG])
+            result = fit_flights(beliefs, flights, self._settings, taken.flight.heliostats)
+            flights.leave_out([n for n, fit in result.items() if fit.outcome in WRONG])
             beliefs.flights = flights
-            fits.update(found)
+            fits.update(result)
         done = set()
         for name in fits:
             record = beliefs.record(name)
@@ -225,8 +225,8 @@ class FlightIntake:
             if record is not None and record.at >= last:
                 done.add(name)
         # Only waiting fits are repeated; with many flights the start would take minutes otherwise.
-        left = {name: fit for name, fit in fits.items() if name not in done}
-        fits |= follow_flights(beliefs, beliefs.flights, self._settings, left)
+        rest = {name: fit for name, fit in fits.items() if name not in done}
+        fits |= follow_flights(beliefs, beliefs.flights, self._settings, rest)
         for name, fit in fits.items():
             waiting = self._sorted(fit)
             self._waiting[name] = replace(waiting, way=_Way.IN_USE) if name in done else waiting
@@ -269,7 +269,7 @@ class FlightIntake:
     def views(self) -> tuple[FlightView, ...]:
         """Return the flights, the last imported first."""
         flights = self._plant.beliefs.flights
-        return tuple(self._view(k, each) for k, each in enumerate(flights))[::-1]
+        return tuple(self._view(k, item) for k, item in enumerate(flights))[::-1]
 
     def _view(self, number: int, taken: TakenFlight) -> FlightView:
         flight = taken.flight

@@ -52,7 +52,7 @@ class Learner(Protocol):
 class _Group:
     """The hyperparameters in force for one group, and how the last attempt ended.
 
-    Version 0 stands for the defaults.
+    Version 0 means the defaults.
     """
 
     entry: LearningEntry
@@ -166,22 +166,22 @@ class Learning:
         group, beliefs = self._groups[name], self._plant.beliefs
         group.known = self._count(name)
         heliostats = self._plant.design.groups[name]
-        seen = [beliefs.known(each) for each in heliostats.names]
+        known = [beliefs.known(each) for each in heliostats.names]
         task = GroupHistory(
             heliostats.mechanism,
-            tuple(None if one is None else one.sightings for one in seen),
+            tuple(None if item is None else item.sightings for item in known),
             self._names_of(name),
             self._in_force(name),
         )
         before = group.said
         try:
-            found = await learner.learn(task)
+            result = await learner.learn(task)
         except HeliotropeError as error:
             version = group.entry.version
             kept = f"version {version} stays" if version else "the defaults stay"
             group.said = f"nothing new was learnt: {error}; {kept} in force"
         else:
-            group.said = self._judged(name, group, person, found)
+            group.said = self._judged(name, group, person, result)
         if group.said != before:
             self._log.event("calibration", person.name, f"group {name}: {group.said}")
 
@@ -223,8 +223,8 @@ class Learning:
             if entry.group not in self._groups:
                 continue  # the plant file has changed; the store still has it
             try:
-                found = json.loads(entry.document)
-                hyper = read_hyperparameters(found["hyper"])
+                result = json.loads(entry.document)
+                hyper = read_hyperparameters(result["hyper"])
                 if not set(hyper.names) <= self._known_of(entry.group):
                     raise InputError("its parameters are not those of the mechanism")
             except (ValueError, KeyError, TypeError, InputError) as error:
@@ -254,8 +254,8 @@ class Learning:
         return learnt or defaults(heliostats.mechanism, self._names_of(name))
 
     def _count(self, name: str) -> int:
-        seen = [self._plant.beliefs.known(n) for n in self._plant.design.groups[name].names]
-        return sum(len(one) for one in seen if one is not None)
+        known = [self._plant.beliefs.known(n) for n in self._plant.design.groups[name].names]
+        return sum(len(item) for item in known if item is not None)
 
     def _utc(self) -> float:
         return self._plant.clock.utc().timestamp()

@@ -165,7 +165,7 @@ def _cluster(reason: Callable[[Guards, str], str | None]) -> Check:
 def _alarm(condition: str = "", among: tuple[int, ...] = tuple(range(len(states.STATES)))) -> Check:
     """Block heliostats, in some states, that the safety table keeps away.
 
-    ``condition`` selects one row of the table; "" stands for any row.
+    ``condition`` selects one row of the table; "" means any row.
     """
 
     def check(plant: Guards, asked: Asked) -> Iterable[str | None]:

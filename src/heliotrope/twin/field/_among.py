@@ -12,7 +12,7 @@ Bools = npt.NDArray[np.bool_]
 def _table(members: tuple[int, ...]) -> Bools:
     """Return a table that says for each code whether it is a member.
 
-    The last entry stands for -1, no power.
+    The last entry represents -1, no power.
     """
     table = np.zeros(16, dtype=np.bool_)
     table[list(members)] = True
