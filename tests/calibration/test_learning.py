@@ -176,7 +176,7 @@ def test_false_alarms_are_as_rare_as_stated() -> None:
     share = np.mean([mask.any() for mask in trials])
     assert 0.02 < share < 0.09
     assert critical(100, 0.01) == pytest.approx(2 * np.log(1e4))
-    with pytest.raises(InputError, match="alpha 2"):
+    with pytest.raises(InputError, match=r"alpha must be .* not 2"):
         generalised_esd(rng.normal(size=(5, 2)), np.eye(10), alpha=2.0)
 
 
