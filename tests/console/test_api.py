@@ -370,13 +370,14 @@ def test_the_store_is_asked_beside_the_loop(
 ) -> None:
     people, threads = console.keeper.people, []
     look = people.valid
-    console.console_call(console.server.app.state.console.roster.forget)
 
     def noted(now: float, used: list[str]) -> object:
         threads.append(threading.current_thread())
         return look(now, used)
 
     monkeypatch.setattr(people, "valid", noted)
+    # The roster is read again now and then: it forgets after whoever reads it is noted.
+    console.console_call(console.server.app.state.console.roster.forget)
     assert ask("viewer", "GET", "sun").status_code == 200
     loops = {console.call(threading.current_thread), console.console_call(threading.current_thread)}
     assert threads

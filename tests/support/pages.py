@@ -33,7 +33,8 @@ def browsers() -> Iterator[Any]:
 def entering(address: str, browser: Any) -> Iterator[Callable[..., Any]]:
     """Sign in as somebody of a role; what goes wrong in the page fails the test.
 
-    The function takes the role, and options of the browser's context such as ``has_touch``.
+    The function takes the role, and options of the browser's context such as ``has_touch``. What
+    the page showed at the end is printed, so that a failed test shows it.
     """
     opened, wrong = [], []
 
@@ -43,6 +44,8 @@ def entering(address: str, browser: Any) -> Iterator[Callable[..., Any]]:
         opened.append(context)
         page = context.new_page()
         page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("requestfailed", lambda asked: print(f"failed: {asked.method} {asked.url}"))
+        page.on("response", lambda a: a.status >= 400 and print(f"{a.status}: {a.url}"))
         page.on("console", lambda line: "Security Policy" in line.text and wrong.append(line.text))
         page.goto(address)
         page.wait_for_url("**/login")
@@ -55,6 +58,9 @@ def entering(address: str, browser: Any) -> Iterator[Callable[..., Any]]:
 
     yield go
     for context in opened:
+        for page in context.pages:
+            with contextlib.suppress(Exception):  # a page that is gone shows nothing
+                print(f"{page.url}: {page.evaluate('document.body.innerText')[:4000]!r}")
         context.close()
     assert not wrong
 

@@ -129,13 +129,17 @@ addEventListener("pointerdown", () => {
   });
 }, true);
 
+// How long a reading may take, ms.
+const LONGEST = 30e3;
 export async function api(method, path, body) {
   const options = { method, headers: { "X-CSRF-Token": meta("heliotrope-csrf") }, credentials: "same-origin" };
   if (body !== undefined) {
     options.body = JSON.stringify(body);
     options.headers["Content-Type"] = "application/json";
   }
-  const answer = await fetch(`/api/v1/${path}`, options);
+  // A reading that never ends would leave its panel as it is for ever; an order waits as long as the plant takes.
+  if (method === "GET") options.signal = AbortSignal.timeout(LONGEST);
+  const answer = await fetch(`/api/v1/${path}`, options).catch(() => { throw new ApiError(0, t("the console does not answer")); });
   // The page was left alone for long: the person confirms, and the order goes again.
   if (answer.status === 423 && await store.confirm()) return api(method, path, body);
   if (answer.status === 401) { location.assign("/login"); throw new ApiError(401, t("signed out")); }
