@@ -193,7 +193,7 @@ export class FieldMap {
 
   // A text above the squares: its edge has the colour of the ground, so that it is read and hides few of them.
   write(c, text, px, py, ink, night) {
-    c.strokeStyle = night ? "#12161b" : "#f4f5f6"; c.lineWidth = 3; c.lineJoin = "round";
+    c.strokeStyle = night ? "#12161b" : "#f4f5f6"; c.lineWidth = 4; c.lineJoin = "round";
     c.strokeText(text, px, py);
     c.fillStyle = ink; c.fillText(text, px, py);
   }
