@@ -11,13 +11,9 @@ import numpy as np
 import pytest
 
 from support.live_console import LiveConsole
-from support.pages import NEEDS_BROWSER, drag, press, said, task, until
+from support.pages import NEEDS_BROWSER, SCREENS, drag, press, said, task, until
 
 pytestmark = NEEDS_BROWSER
-SCREENS: dict[str, dict[str, Any]] = {
-    "desktop": {"viewport": {"width": 1440, "height": 900}},
-    "tablet": {"viewport": {"width": 820, "height": 1180}, "has_touch": True},
-}
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,11 @@ from support.live_console import PASSWORD
 
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
 ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+#: A desktop with a mouse, and a tablet that is touched: options of the browser's context.
+SCREENS: dict[str, dict[str, Any]] = {
+    "desktop": {"viewport": {"width": 1440, "height": 900}},
+    "tablet": {"viewport": {"width": 820, "height": 1180}, "has_touch": True},
+}
 #: Mark of modules that need the browser.
 NEEDS_BROWSER = pytest.mark.skipif(
     not os.path.exists(CHROMIUM) and not os.environ.get("CI"),  # noqa: PTH110 - a word of skipif
