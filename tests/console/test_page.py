@@ -15,7 +15,7 @@ from heliotrope.console.people import FIRST, first_start
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.people import UNSET, ApiToken, Session
 from support.live_console import PASSWORD, LiveConsole
-from support.pages import NEEDS_BROWSER, menu, said, until
+from support.pages import NEEDS_BROWSER, SCREENS, drag, menu, press, said, until
 
 pytestmark = NEEDS_BROWSER
 
@@ -164,18 +164,16 @@ def _drag(page: Any, start: tuple[float, float], end: tuple[float, float]) -> No
     at = [
         page.evaluate("([x, y]) => heliotropeMap.toScreen(x, y)", place) for place in (start, end)
     ]
-    (x, y), (u, v) = [(box["x"] + x, box["y"] + y) for x, y in at]
     page.keyboard.down("Shift")
-    page.mouse.move(x, y)
-    page.mouse.down()
-    for k in range(1, 6):
-        page.mouse.move(x + 0.2 * k * (u - x), y + 0.2 * k * (v - y))
-    page.mouse.up()
+    drag(page, *((box["x"] + x, box["y"] + y) for x, y in at))
     page.keyboard.up("Shift")
 
 
-def test_shapes_rows_and_clusters_select(field: LiveConsole, enter: Callable[[str], Any]) -> None:
-    page = enter("viewer")
+@pytest.mark.parametrize("screen", SCREENS)
+def test_shapes_rows_and_clusters_select(
+    field: LiveConsole, enter: Callable[..., Any], screen: str
+) -> None:
+    page = enter("viewer", **SCREENS[screen])
     places = np.asarray(field.live.operations.viewer.positions)[:, :2]
     tower = page.evaluate("heliotrope.store.field.tower.slice(0, 2)")
     away = np.hypot(*(places - tower).T)
@@ -213,12 +211,11 @@ def test_shapes_rows_and_clusters_select(field: LiveConsole, enter: Callable[[st
     spot = page.evaluate(
         f"heliotropeMap.toScreen(heliotropeMap.x[{middle}], heliotropeMap.y[{middle}])"
     )
-    box = page.locator(".hx-map-field").bounding_box()
-    page.mouse.click(box["x"] + spot[0], box["y"] + spot[1])
+    press(page, ".hx-map-field", position={"x": spot[0], "y": spot[1]})
     cluster = field.live.operations.plant.field.cluster
     assert selected() == set(np.flatnonzero(cluster == cluster[middle]).tolist())
     page.select_option("[aria-label='Select by']", "row")
-    page.mouse.click(box["x"] + spot[0], box["y"] + spot[1])
+    press(page, ".hx-map-field", position={"x": spot[0], "y": spot[1]})
     assert middle in selected()
     assert len(selected()) > 3
     page.select_option("[aria-label='Select by']", "pan")

@@ -59,6 +59,7 @@ def test_german_is_chosen_at_the_sign_in_and_stays(
     page = enter("engineer")  # the browser's own language: English
     assert page.get_attribute("html", "lang") == "en"
     assert len(english_left(page)) > 40
+    assert page.locator("#language option").count() == 3
     menu(page, "Sign out")
     page.wait_for_url("**/login")
     page.select_option("#language", "de")

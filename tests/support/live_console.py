@@ -236,6 +236,11 @@ class LiveConsole:
         """How many heliostats are in each state, as the plant knows them."""
         return self.call(lambda: dict(self.live.operations.summary().states))
 
+    def produced(self) -> bool:
+        """Whether figures are kept in which a receiver gets power."""
+        rows = self.keeper.figures(0.0, 1e11)
+        return any(v > 0.0 for row in rows for name, v in row.values.items() if "power" in name)
+
     def release(self) -> None:
         """Release the command authority, whoever holds it: a failed test keeps nothing."""
 

@@ -13,6 +13,11 @@ from support.live_console import PASSWORD
 
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
 ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+#: A desktop with a mouse, and a tablet that is touched: options of the browser's context.
+SCREENS: dict[str, dict[str, Any]] = {
+    "desktop": {"viewport": {"width": 1440, "height": 900}},
+    "tablet": {"viewport": {"width": 820, "height": 1180}, "has_touch": True},
+}
 #: Mark of modules that need the browser.
 NEEDS_BROWSER = pytest.mark.skipif(
     not os.path.exists(CHROMIUM) and not os.environ.get("CI"),  # noqa: PTH110 - a word of skipif
@@ -65,6 +70,33 @@ def entering(address: str, browser: Any) -> Iterator[Callable[..., Any]]:
     assert not wrong
 
 
+def _touched(page: Any) -> bool:
+    return bool(page.evaluate("navigator.maxTouchPoints"))
+
+
+def press(page: Any, what: str, **options: Any) -> None:
+    """Click with the mouse; on a screen for touch, tap."""
+    (page.tap if _touched(page) else page.click)(what, **options)
+
+
+def drag(page: Any, *places: tuple[float, float]) -> None:
+    """Draw a line through places of the window, px, with the mouse or a finger."""
+    if not _touched(page):
+        page.mouse.move(*places[0])
+        page.mouse.down()
+        for place in places[1:]:
+            page.mouse.move(*place, steps=5)
+        page.mouse.up()
+        return
+    session = page.context.new_cdp_session(page)
+    for k, (x, y) in enumerate(places):
+        points = {"type": "touchMove" if k else "touchStart", "touchPoints": [{"x": x, "y": y}]}
+        session.send("Input.dispatchTouchEvent", points)
+        page.wait_for_timeout(50)  # moves within one frame would be one; a quick lift is a fling
+    session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    session.detach()
+
+
 def until(page: Any, holds: str, arg: Any = None, within: float = 90.0) -> None:
     """Wait until an expression holds in the page.
 
@@ -107,7 +139,7 @@ def orders_counted(page: Any) -> set[str]:
 
 @contextlib.contextmanager
 def task(page: Any, name: str) -> Iterator[None]:
-    """Print how many clicks and seconds a person's task takes."""
+    """Print how many clicks or taps, and seconds, a person's task takes on a screen."""
     page.evaluate(
         "() => { if (window.clicks === undefined) addEventListener('click', (e) => { "
         "window.clicks += e.isTrusted && e.detail > 0; }, true); window.clicks = 0; }"
@@ -115,4 +147,5 @@ def task(page: Any, name: str) -> Iterator[None]:
     begun = time.monotonic()
     yield
     took = time.monotonic() - begun
-    print(f"{name}: {page.evaluate('window.clicks')} clicks, {took:.1f} s")
+    wide, clicks = page.viewport_size["width"], page.evaluate("window.clicks")
+    print(f"{name}, {wide} px wide: {clicks} clicks, {took:.1f} s")

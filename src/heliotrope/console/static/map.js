@@ -130,6 +130,7 @@ export class FieldMap {
     const size = Math.max(2, Math.min(26, (store.field.size ?? 2.2) * this.scale * 0.85));
     const half = 0.5 * size;
     this.drawSquares(c, size);
+    this.drawDistances(c, night);
     if (size > 14) this.drawNames(c, half, night);
     this.drawMarks(c, half, night);
     this.drawSun(c, night);
@@ -164,12 +165,8 @@ export class FieldMap {
   drawGround(c, night) {
     const head = store.head, [tx, ty] = this.toScreen(store.field.tower[0], store.field.tower[1]);
     // Rings of distance around the tower.
-    c.strokeStyle = night ? "#232a32" : "#dfe2e6"; c.fillStyle = night ? "#56606b" : "#8b949e";
-    c.lineWidth = 1; c.font = "11px sans-serif"; c.textAlign = "left";
-    const step = [5, 10, 20, 50, 100, 200, 500, 1000].find((s) => s * this.scale > 70) ?? 1000;
-    for (let k = 1; k <= 12; k++) {
-      c.beginPath(); c.arc(tx, ty, k * step * this.scale, 0, 2 * Math.PI); c.stroke();
-    }
+    c.strokeStyle = night ? "#232a32" : "#dfe2e6"; c.lineWidth = 1;
+    for (const distance of this.distances()) { c.beginPath(); c.arc(tx, ty, distance * this.scale, 0, 2 * Math.PI); c.stroke(); }
     // The tower's shadow, as long as the sun is up.
     if (store.live && head?.sun && head.sun.elevation > 0.02) {
       const length = Math.min(3000, store.field.tower[2] / Math.tan(head.sun.elevation)) * this.scale;
@@ -177,11 +174,28 @@ export class FieldMap {
       c.beginPath(); c.moveTo(tx, ty);
       c.lineTo(tx - length * Math.sin(head.sun.azimuth), ty + length * Math.cos(head.sun.azimuth)); c.stroke();
     }
-    for (let k = 1; k <= 12; k++) c.fillText(`${k * step} m`, tx + 4, ty + k * step * this.scale - 4);
     c.fillStyle = night ? "#e8eaed" : "#202428";
     c.beginPath(); c.arc(tx, ty, 5, 0, 2 * Math.PI); c.fill();
-    c.fillText(t("tower"), tx + 8, ty - 6);
+    c.font = "11px sans-serif"; c.textAlign = "left"; c.fillText(t("tower"), tx + 8, ty - 6);
     this.drawKeepOuts(c, night);
+  }
+
+  distances() {
+    const step = [5, 10, 20, 50, 100, 200, 500, 1000].find((s) => s * this.scale > 70) ?? 1000;
+    return Array.from({ length: 12 }, (_, k) => (k + 1) * step);
+  }
+
+  drawDistances(c, night) {
+    const [tx, ty] = this.toScreen(store.field.tower[0], store.field.tower[1]);
+    c.font = "11px sans-serif"; c.textAlign = "left";
+    for (const distance of this.distances()) this.write(c, `${distance} m`, tx + 4, ty + distance * this.scale - 4, night ? "#aab4bf" : "#57606a", night);
+  }
+
+  // A text above the squares: its edge has the colour of the ground, so that it is read and hides few of them.
+  write(c, text, px, py, ink, night) {
+    c.strokeStyle = night ? "#12161b" : "#f4f5f6"; c.lineWidth = 4; c.lineJoin = "round";
+    c.strokeText(text, px, py);
+    c.fillStyle = ink; c.fillText(text, px, py);
   }
 
   drawKeepOuts(c, night) {
@@ -245,12 +259,10 @@ export class FieldMap {
       c.strokeStyle = colourOf("SEARCHING"); c.lineWidth = 2;
       c.beginPath(); c.arc(px, py, half + 5, 0, 2 * Math.PI); c.stroke();
       const text = `${name} → ${ring}`;
-      c.font = "600 11px sans-serif"; c.textAlign = "left"; c.fillStyle = night ? "#12161be0" : "#f4f5f6e0";
+      c.font = "600 11px sans-serif"; c.textAlign = "left";
       // On the side that has room for it.
       const wide = c.measureText(text).width, left = px + half + 10 + wide > this.width ? px - half - 10 - wide : px + half + 10;
-      c.fillRect(left - 3, py - 8, wide + 6, 16);
-      c.fillStyle = night ? "#f2b134" : "#8a5a00";
-      c.fillText(text, left, py + 4);
+      this.write(c, text, left, py + 4, night ? "#f2b134" : "#8a5a00", night);
     }
   }
 

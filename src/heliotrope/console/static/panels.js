@@ -54,7 +54,7 @@ export function plant(box) {
     if (order === proven) return;
     proven = order;
     proof.replaceChildren(...(head.order.on ? [h("p", { className: "hx-said bad" },
-      t("{act} of the field, ordered by {who}: {acknowledged} of {all} acknowledged, {done} done. {text}", { act: t(head.order.act), who: head.order.who, acknowledged: count(head.order.acknowledged), all: count(head.order.heliostats), done: count(head.order.done), text: head.order.text })), facts([
+      t("{act} of the field, ordered by {who}: {acknowledged} of {all} acknowledged, {done} done", { act: t(head.order.act), who: head.order.who, acknowledged: count(head.order.acknowledged), all: count(head.order.heliostats), done: count(head.order.done) }), head.order.text && `; ${head.order.text}`), facts([
       [t("Measured"), head.order.measured ? t("the flux, below its limit") : t("nothing since the order")],
       [t("Seen to move today"), Object.entries(head.order.followed).map(([by, n]) => t("{n} by {by}", { n: count(n), by })).join(", ") || t("none")],
       ...(head.order.not_done.length ? [[t("Not done"), listedIn(head.order, "not_done", "not_done", unfolded)]] : []),

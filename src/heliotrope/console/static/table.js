@@ -27,6 +27,8 @@ const saved = () => JSON.parse(localStorage.getItem(SAVED) ?? "{}");
 export function heliostats(box) {
   let by = 3, down = true, rows = [], last = -1;
   const which = h("input", { type: "search", className: "hx-query", placeholder: t("all; or state = TRACKING and error > 1"), ariaLabel: t("Rows"), title: t("Names or conditions, as above the map; empty: all") });
+  // How many of them, from the top: by touch and by keyboard there is no Shift-click.
+  const most = h("select", { ariaLabel: t("Number of rows"), onchange: () => sorted() }, h("option", { value: Infinity }, t("all rows")), [10, 20, 50, 100].map((n) => h("option", { value: n }, t("top {n}", { n }))));
   const number = h("span", { className: "hx-hint" }), head = h("div", { className: "hx-grid-row head", role: "row" }), body = h("div", { className: "hx-grid-body" });
   const grid = h("div", { className: "hx-grid", role: "grid", tabIndex: 0 }, head, body);
   const lines = new Map(); // the rows in the page, by their places
@@ -39,6 +41,7 @@ export function heliostats(box) {
     const get = COLUMNS[by][2], sign = down ? -1 : 1, key = new Map(rows.map((i) => [i, get(i)])), none = (v) => typeof v === "number" && Number.isNaN(v);
     // Those without a value come last in both directions.
     rows.sort((a, b) => { const x = key.get(a), y = key.get(b); return none(x) || none(y) ? none(x) - none(y) : sign * (x < y ? -1 : x > y ? 1 : 0); });
+    rows.splice(Number(most.value));
     number.textContent = t("{n} of {all}", { n: count(rows.length), all: count(store.field.names.length) });
     titles.forEach((button, k) => {
       button.ariaSort = k === by ? (down ? "descending" : "ascending") : "none";
@@ -101,7 +104,7 @@ export function heliostats(box) {
   which.addEventListener("keydown", (event) => { if (event.key === "Enter") sorted(); event.stopPropagation(); });
   which.addEventListener("search", sorted);
   grid.addEventListener("scroll", slide);
-  box.append(h("div", { className: "hx-row hx-search" }, which, button(t("Show"), sorted, "main"), number), h("div", { className: "hx-row hx-search" },
+  box.append(h("div", { className: "hx-row hx-search" }, which, most, button(t("Show"), sorted, "main"), number), h("div", { className: "hx-row hx-search" },
     button(t("Select these"), () => store.select(rows, rows.length === 1 ? rows[0] : -1)), button(t("Show the selection"), () => { which.value = store.selected().join(" "); sorted(); }), button(t("Save selection…"), keep), kept, button(t("Save as CSV"), csv)), grid);
   list(); sorted();
   let at = 0; // values change with each frame, their order every five seconds, but not under a pointer that chooses a row

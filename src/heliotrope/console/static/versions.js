@@ -64,7 +64,7 @@ export async function compareVersions(name) {
   };
   const back = h("button", { type: "button", className: "hx-button", onclick: () => give({ version: Number(first.value) }) });
   const set = h("button", { type: "button", className: "hx-button", onclick: () => (typed.size ? give({ values: Object.fromEntries([...typed].map(([key, one]) => [key, one.value])) }) : tell(t("type new values first"), true)) }, known.approval ? t("Ask for new values") : t("Store new values"));
-  const dialog = h("dialog", { className: "hx-dialog wide hx-versions hx-view" }, h("h2", {}, t("Parameters of {name}: {n} versions", { name, n: count(about.length) })),
+  const dialog = h("dialog", { className: "hx-dialog wide hx-versions hx-view" }, h("h2", {}, t("Parameters of {name}, versions: {n}", { name, n: count(about.length) })),
     h("div", { className: "hx-row hx-search" }, first, "→", second), body, waits,
     engineer ? h("div", { className: "hx-row hx-search" }, reason, back, set) : "", engineer ? h("p", { className: "hx-hint" }, known.approval ? t("Nothing is written until another engineer has approved it on the heliostat's tab.") : t("The heliostat must be at stow, locked or at rest; it needs the command authority ({who}).", { who: store.mine ? t("you have it") : t("take command first") })) : "", told,
     h("div", { className: "hx-row" }, h("button", { type: "button", className: "hx-button main", onclick: () => dialog.close("") }, t("Close"))));

@@ -70,6 +70,8 @@ function offer(choice) {
   choice.addEventListener("change", () => { localStorage.setItem(KEPT, choice.value); location.reload(); });
 }
 
+// EMERGENCY's script, which stands before the rest of the page, may have asked for the words: its texts are all there once it is parsed.
+if (document.readyState === "loading") await new Promise((wake) => document.addEventListener("readystatechange", wake, { once: true }));
 document.documentElement.lang = now === ENGLISH ? LANGUAGES[0] : language;
 translate();
 const choice = document.getElementById("language");
