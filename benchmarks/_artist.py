@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks._run import why_missing
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.geometry import angle_between, reflect
 
@@ -29,13 +30,7 @@ WORKER = Path(__file__).with_name("_artist_worker.py")
 
 def why_skipped() -> str | None:
     """Return why ARTIST is missing from the contenders, None if it is among them."""
-    python = os.environ.get(PYTHON)
-    if not python:
-        return f"not set: {PYTHON}"
-    asked = [python, "-c", "import artist, torch"]
-    if subprocess.run(asked, capture_output=True, check=False).returncode:
-        return f"{python} cannot import artist and torch"
-    return None
+    return why_missing(PYTHON, ("artist", "torch"))
 
 
 def reconstruct(data: Path, jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -155,6 +155,27 @@ def peak_bytes(call: Call) -> int:
         tracemalloc.stop()
 
 
+def why_missing(variable: str, modules: tuple[str, ...]) -> str | None:
+    """Return why a peer cannot take part, None if it can.
+
+    Parameters
+    ----------
+    variable
+        Environment variable that names the peer's interpreter.
+    modules
+        Modules that the interpreter must be able to import.
+    """
+    python = os.environ.get(variable)
+    if not python:
+        return f"not set: {variable}"
+    try:
+        asked = [python, "-c", f"import {', '.join(modules)}"]
+        failed = subprocess.run(asked, capture_output=True, check=False).returncode != 0
+    except OSError:
+        failed = True
+    return f"{python} cannot import {' and '.join(modules)}" if failed else None
+
+
 def agree(what: str, apart: float, limit: float, unit: str) -> float:
     """Return the largest difference between the contenders.
 

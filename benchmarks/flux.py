@@ -5,7 +5,8 @@ where its published positions are (HELIOTROPE_FIELDS names their folder), at sun
 Mirrors are focused at their slant range, flat, or of 35 flat facets that are canted to it.
 "Moved": one mirror in a hundred takes another aim, and the flux is brought up to date. Random rays
 (`embreex`) are timed on the same scene, and their time is scaled to the cells' error of the engine:
-noise falls with the root of their number.
+noise falls with the root of their number. SolarPILOT computes the first field where
+HELIOTROPE_PYSAM_PYTHON names an interpreter with NREL-PySAM.
 """
 
 import json
@@ -15,10 +16,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks import _solarpilot
 from benchmarks._run import Result, Row, timed
 from heliotrope.errors import HeliotropeError
 from heliotrope.geometry import FloatArray, bisector, direction, normalize
@@ -30,6 +33,8 @@ from heliotrope.optics.surfaces import Cylinder
 SIZE, CELLS, PLANT = (11.42, 10.42), (36, 56), 11_915
 #: Ground for each mirror, m².
 GROUND = 600.0
+#: Radius and height of the receiver, m.
+RADIUS, TALL = 7.565, 18.6
 #: Budgets: milliseconds cold, and after one mirror in a hundred moved.
 BUDGET = {(PLANT, "focused"): (60.0, 5.0), (PLANT, "flat"): (250.0, None),
           (PLANT, "faceted"): (250.0, None), (100_000, "focused"): (700.0, None)}  # fmt: skip
@@ -49,7 +54,7 @@ def spiral(count: int) -> tuple[FloatArray, FloatArray, float]:
 def _aims(place: FloatArray, height: float) -> FloatArray:
     """Return points on the cylinder that face the mirrors."""
     flat = place * [1.0, 1.0, 0.0]
-    return np.asarray(7.565 * normalize(flat) + np.array([0.0, 0.0, height]))
+    return np.asarray(RADIUS * normalize(flat) + np.array([0.0, 0.0, height]))
 
 
 def published() -> tuple[FloatArray, FloatArray] | None:
@@ -69,7 +74,7 @@ def scene(
     sun = direction(np.radians(180.0 if elevation > 30.0 else 105.0), np.radians(elevation))
     up, north = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
     center = np.array([0.0, 0.0, height])
-    receiver = Cylinder("receiver", center, up, north, 7.565, 18.6, shape=CELLS)
+    receiver = Cylinder("receiver", center, up, north, RADIUS, TALL, shape=CELLS)
     return Scene(sun, 1000.0, mirrors(place, aim, sun, figure), (receiver,))
 
 
@@ -156,6 +161,31 @@ def rays(given: Scene) -> dict[str, float | str]:
     }
 
 
+def solarpilot(place: FloatArray, aim: FloatArray, height: float) -> dict[str, float | str]:
+    """Return SolarPILOT's seconds for a sun position, and its efficiencies less the engine's."""
+    if (reason := _solarpilot.why_skipped()) is not None:
+        return {"solarpilot": f"not run: {reason}"}
+    found = _solarpilot.flux({
+        "positions": place[:, :2].tolist(), "width": SIZE[0], "height": SIZE[1], "slope": 1.5e-3,
+        "tower": height, "diameter": 2.0 * RADIUS, "tall": TALL, "cells": CELLS,
+    })  # fmt: skip
+    apart = []
+    for azimuth, elevation, efficiency in found["suns"]:
+        sun = direction(np.radians(azimuth), np.radians(elevation))
+        given = replace(
+            scene(place, aim, height, "focused"),
+            sun=sun,
+            mirrors=mirrors(place, aim, sun, "focused"),
+        )
+        sunlight = given.dni * given.mirrors.area.sum()
+        apart.append(efficiency - FieldFlux(given, sun="pillbox").powers[0] / sunlight)
+    return {
+        "solarpilot_layout_s": found["layout_s"],
+        "solarpilot_s": found["sun_s"],
+        "solarpilot_efficiency_apart_percent": 100.0 * float(max(apart, key=abs)),
+    }
+
+
 _START = """
 import time; a = time.perf_counter()
 from benchmarks.flux import CELLS, scene, spiral
@@ -197,10 +227,12 @@ def run(quick: bool) -> Result:
     figures: dict[str, float | int | str] = {
         "import_s": imports,
         "first_flux_from_cache_s": first,
-        "pysam": "left out: NREL-PySAM is no dependency of the project",
         **second,
+        **solarpilot(*field),
     }
     cold = float(rows[0]["cold_ms"] or 0.0)
+    if "solarpilot_s" in figures:
+        figures["solarpilot_slower"] = 1e3 * float(figures["solarpilot_s"]) / cold
     if "rays_s_at_equal_error" in second:
         figures["rays_slower"] = 1e3 * float(second["rays_s_at_equal_error"]) / cold
     kept = all(

@@ -532,6 +532,28 @@ def test_field_stands_where_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (place[:, 1] >= 0.0).all()
 
 
+@pytest.mark.parametrize("name", ["_artist", "_solarpilot"])
+def test_a_peer_that_is_not_here_is_named(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    peer = _module(monkeypatch, name)
+    monkeypatch.delenv(peer.PYTHON, raising=False)
+    assert peer.why_skipped() == f"not set: {peer.PYTHON}"
+    for python in ("/nowhere/python", sys.executable):
+        monkeypatch.setenv(peer.PYTHON, python)
+        assert peer.why_skipped().startswith(f"{python} cannot import ")
+
+
+@pytest.mark.skipif(
+    not os.environ.get("HELIOTROPE_PYSAM_PYTHON"),
+    reason="HELIOTROPE_PYSAM_PYTHON names no interpreter with NREL-PySAM",
+)
+def test_solarpilot_computes_the_same_field(monkeypatch: pytest.MonkeyPatch) -> None:
+    flux = _module(monkeypatch, "flux")
+    found = flux.solarpilot(*flux.spiral(200))
+    assert found["solarpilot_s"] > 0.0
+    # Its images and its union of shading and blocking are others; the geometry is the same.
+    assert abs(found["solarpilot_efficiency_apart_percent"]) < 1.5
+
+
 def test_peak_memory_is_seen_and_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
     shared = _module(monkeypatch, "_run")
     assert 8e6 <= shared.peak_bytes(lambda: np.zeros(1_000_000)) < 9e6

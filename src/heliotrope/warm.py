@@ -162,7 +162,7 @@ def lighting() -> None:
 
 
 def cutting() -> None:
-    """Cast the light of three heliostats on a mesh, and clip one mirror."""
+    """Cast the light of three heliostats on a mesh with its uncertainty, and clip one mirror."""
     from dataclasses import replace
 
     import numpy as np
@@ -176,7 +176,7 @@ def cutting() -> None:
     plant, light = malan_plant(3), FieldOptics()
     scene = light.scene(plant, normalize((0.0, 0.6, 0.8)), None, ())
     mesh = Mesh("mesh", plant.targets[0].corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    light.engine(replace(scene, surfaces=(mesh,)))
+    light.engine(replace(scene, surfaces=(mesh,))).power_slope()
     Shading(scene).pieces(0)
 
 

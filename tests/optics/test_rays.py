@@ -229,3 +229,21 @@ def test_the_power_of_a_cavity_is_what_passes_its_aperture() -> None:
     caught = traced.flux[0] @ area
     assert 0.2 * traced.power[0] < caught < 0.8 * traced.power[0]
     assert found.maps[0] @ area == pytest.approx(caught, rel=0.02)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_the_image_of_a_close_mirror_changes_over_the_depth_of_a_cavity(flat: bool) -> None:
+    """Behind its focus a beam grows, and that of a partly blocked mirror moves aside."""
+    receiver = Receiver(
+        "cavity", "cavity", MIDDLE, NORTH, 4.0, 4.0, mesh=cavity_wall(3.5, 2.6, 5.0, (16, 32))
+    )
+    places = np.array([[0.0, 40.0, 50.0], [-3.4, 41.0, 50.0], [0.4, 41.5, 49.0], [4.0, 43.0, 50.0]])
+    focal = np.inf if flat else np.linalg.norm(places - MIDDLE, axis=-1)
+    given = scene(places, surface_of(receiver), slope=1.5 * MRAD, focal=focal)
+    traced, found = trace(given, 1e6, air="none", seed=4), FieldFlux(given, air="none")
+    assert traced.lit.min() < 0.2
+    peak = traced.flux[0].max()
+    apart = np.mean((found.maps[0] - traced.flux[0]) ** 2) - np.mean(traced.error[0] ** 2)
+    assert np.sqrt(max(apart, 0.0)) < (0.004 if flat else 0.002) * peak
+    area = given.surfaces[0].cells.area
+    assert found.maps[0] @ area == pytest.approx(traced.flux[0] @ area, rel=0.008)

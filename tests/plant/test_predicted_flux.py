@@ -12,9 +12,11 @@ from heliotrope.field.mirror_surface import MirrorSurface
 from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray, normalize
 from heliotrope.optics import (
+    Cavity,
     Cylinder,
     FieldOptics,
     FluxView,
+    Mesh,
     Mirrors,
     Plate,
     Scene,
@@ -145,6 +147,39 @@ def test_its_uncertainty_is_that_of_fields_with_errors() -> None:
     (sure,) = predicted(_field(12, 0.0), light)
     assert sure.sigma.max() < 1e-6 * sure.peak
     assert sure.power_sigma < 1e-6 * sure.power
+
+
+def _in_triangles(plate: Plate, depth: float) -> Mesh:
+    """The cells of a plate, each as two triangles, moved back by a depth."""
+    rows, columns = plate.shape
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, columns + 1), np.linspace(-0.5, 0.5, rows + 1))
+    flat = x[..., None] * plate.width * plate.right + y[..., None] * plate.height * plate.up
+    one = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
+    over = one + columns + 1
+    faces = [np.stack([one, one + 1, over + 1], -1), np.stack([one, over + 1, over], -1)]
+    middle = plate.center - depth * plate.normal
+    return Mesh(plate.name, middle + flat.reshape(-1, 3), np.concatenate(faces))
+
+
+@pytest.mark.parametrize("depth", [0.0, 1.5])
+def test_a_mesh_and_a_cavity_have_an_uncertainty_too(depth: float) -> None:
+    """Behind an aperture, the power is what enters and the cells are those of the wall."""
+    scene, light = _field(12, 0.7e-3), FieldOptics()
+    (plate,) = scene.surfaces
+    assert isinstance(plate, Plate)
+    wall = _in_triangles(replace(plate, width=5.0, height=5.0) if depth else plate, depth)
+    scene = replace(scene, surfaces=(Cavity(plate, wall) if depth else wall,))
+    (shown,) = predicted(scene, light)
+    maps, powers = _drawn(scene, light)
+    bright = shown.flux > 0.3 * shown.peak
+    true = np.std(maps, axis=0).reshape(shown.flux.shape)
+    np.testing.assert_allclose(shown.sigma[bright], true[bright], rtol=0.3)
+    assert shown.power_sigma == pytest.approx(np.std(powers), rel=0.15)
+    assert shown.peak_sigma == shown.sigma[0, shown.flux.argmax()]
+    if not depth:
+        (flat,) = predicted(_field(12, 0.7e-3), light)
+        both = shown.sigma.reshape(2, 12, 12)
+        np.testing.assert_allclose(both.mean(axis=0), flat.sigma, atol=0.05 * flat.sigma.max())
 
 
 def test_a_second_receiver_has_its_own_uncertainty() -> None:

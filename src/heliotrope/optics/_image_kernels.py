@@ -147,13 +147,18 @@ def _place(row, sun, ray, axes, t, x, y, tilt_x, tilt_y, into):
 
 
 @njit(**INNER)
-def _images(i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, images, work):
-    """Compute the merged images of mirror i's parts; return their number and the light's area."""
+def _images(
+    i, row, sun, ray, axes, cosine, t, depth, sigma, parts, surfaces, moments, images, work
+):  # fmt: skip
+    """Compute the merged images of mirror i's parts; return their number and the light's area.
+
+    The images are those at distance ``depth``; parts are merged if they are close at distance t.
+    """
     table, kind, split, begin = parts
     turn, spread, place = work
     _turn(row, sun, cosine, axes, turn)
     curve = row[14]
-    _spread(turn, axes, row, t, curve, spread)
+    _spread(turn, axes, row, depth, curve, spread)
     count, total = 0, 0.0
     close = 1.0 / (CLOSE * sigma)
     for f in range(begin[i + 1] - begin[i]):
@@ -165,8 +170,8 @@ def _images(i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, 
         if len(table):
             surface = surfaces[kind[i], f]
             tilt_x, tilt_y, curve = surface[0], surface[1], surface[2]
-            rough = surface[3] * t * t
-            _spread(turn, axes, row, t, curve, spread)
+            rough = surface[3] * depth * depth
+            _spread(turn, axes, row, depth, curve, spread)
         else:
             x, y = 0.0, 0.0
         tilt_x -= curve * (lit[1] - x)
@@ -180,9 +185,11 @@ def _images(i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, 
         uu += rough * (turn[0, 0] ** 2 + turn[0, 1] ** 2)
         uv += rough * (turn[0, 0] * turn[1, 0] + turn[0, 1] * turn[1, 1])
         vv += rough * (turn[1, 0] ** 2 + turn[1, 1] ** 2)
+        key_u, key_v = math.floor(place[0] * close + 0.5), math.floor(place[1] * close + 0.5)
+        if depth != t:
+            _place(row, sun, ray, axes, depth, lit[1], lit[2], tilt_x, tilt_y, place)
         u, v = place[0], place[1]
         total += power
-        key_u, key_v = math.floor(u * close + 0.5), math.floor(v * close + 0.5)
         k = 0
         while k < count and not (images[k, 6] == key_u and images[k, 7] == key_v):
             k += 1
@@ -487,8 +494,9 @@ def cast(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts, 
         uu, uv, vv = _blur(row, sun, cosine, axes, slopes[i], pointing[i], turn)
         sigma = reach * math.sqrt(0.5 * (uu + vv) + total)
         count, leaving = _images(
-            i, row, sun, ray, axes, cosine, reach, sigma, parts, surfaces, moments, images, work
-        )
+            i, row, sun, ray, axes, cosine, reach, reach, sigma, parts, surfaces, moments, images,
+            work,
+        )  # fmt: skip
         out[i, 0] = light[i] * leaving
         if t <= 0.0:
             continue
@@ -508,155 +516,3 @@ def cast(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts, 
                 )  # fmt: skip
                 begin, end = min(begin, a), max(end, b)
         out[i, 1] = area * _gather(seen, visible, begin, end, local, sign, flux, room[0])
-
-
-@njit(**OPTIONS)
-def cast_cells(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts, surfaces,
-               moments, middle, cells, hidden, group, aperture, sign, flux, out):  # fmt: skip
-    """Add the images of mirrors ``rows[first:last]`` to the flux of cells of any shape.
-
-    ``cells`` (C, 16): centre, normal, area and second moments (9) of each cell. ``hidden`` (D, C):
-    cells that other cells hide as seen from each of D directions; ``group`` (H,) is the direction
-    of each mirror. ``aperture``: centre, right and up (3 each) and half sizes of a rectangle that
-    the light must pass; empty if there is none. ``flux`` (C,) in W/m²; ``out`` (H, 2) is as in
-    `cast`.
-    """
-    weights, variances = sums
-    ray, axes = np.empty(3), np.empty((2, 3))
-    turn, work = np.empty((2, 2)), (np.empty((2, 2)), np.empty((2, 2)), np.empty(2))
-    most, total = 1, np.sum(weights * variances)
-    for i in rows[first:last]:
-        most = max(most, parts[3][i + 1] - parts[3][i])
-    images = np.empty((most, IMAGE + 2))
-    for i in rows[first:last]:
-        out[i, 0] = out[i, 1] = 0.0
-        if light[i] <= 0.0:
-            continue
-        row = mirrors[i]
-        cosine = _ray(row, sun, ray, axes)
-        if cosine <= 0.0:
-            continue
-        away = (middle[0] - row[0], middle[1] - row[1], middle[2] - row[2])
-        t = _dot(ray, away)
-        reach = t if t > 0.0 else 1.0
-        uu, uv, vv = _blur(row, sun, cosine, axes, slopes[i], pointing[i], turn)
-        sigma = reach * math.sqrt(0.5 * (uu + vv) + total)
-        count, leaving = _images(
-            i, row, sun, ray, axes, cosine, reach, sigma, parts, surfaces, moments, images, work
-        )
-        out[i, 0] = light[i] * leaving
-        if t <= 0.0:
-            continue
-        caught = 0.0
-        for k in range(len(cells)):
-            cell = cells[k]
-            x, y, z = cell[0] - row[0], cell[1] - row[1], cell[2] - row[2]
-            depth = x * ray[0] + y * ray[1] + z * ray[2]
-            facing = -(x * cell[3] + y * cell[4] + z * cell[5])
-            if facing <= 0.0 or depth <= 0.0 or hidden[group[i], k]:
-                continue
-            share = 1.0
-            if len(aperture):
-                share = _passes(aperture, row, x, y, z)
-                if share <= 0.0:
-                    continue
-            scale = t / depth
-            u = scale * (x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2])
-            v = scale * (x * axes[1, 0] + y * axes[1, 1] + z * axes[1, 2])
-            suu, suv, svv = _own(cell, axes, scale)
-            distance = math.sqrt(x * x + y * y + z * z)
-            value = 0.0
-            for m in range(count):
-                image = images[m]
-                pu, pv = u - image[1], v - image[2]
-                for g in range(len(weights)):
-                    a = image[3] + suu + t * t * (uu + variances[g])
-                    b = image[4] + suv + t * t * uv
-                    c = image[5] + svv + t * t * (vv + variances[g])
-                    det = a * c - b * b
-                    form = (pu * pu * c - 2.0 * pu * pv * b + pv * pv * a) / det
-                    if form < 2.0 * DEEP:
-                        value += weights[g] * image[0] * math.exp(-0.5 * form) / math.sqrt(det)
-            value *= light[i] * share * scale * scale * facing / distance / (2.0 * math.pi)
-            flux[k] += sign * value
-            caught += value * cell[6]
-        out[i, 1] = caught
-
-
-@njit(**INNER)
-def _own(cell, axes, scale):
-    """Compute the second moments of a cell across the ray."""
-    form = (0.0, 0.0, 0.0)
-    for p in range(3):
-        for q in range(3):
-            value = scale * scale * cell[7 + 3 * p + q]
-            form = (
-                form[0] + axes[0, p] * axes[0, q] * value,
-                form[1] + axes[0, p] * axes[1, q] * value,
-                form[2] + axes[1, p] * axes[1, q] * value,
-            )
-    return form
-
-
-@njit(**INNER)
-def _passes(aperture, row, x, y, z):
-    """Return the fraction of the rays from a mirror to a point that pass the aperture.
-
-    The point is relative to the mirror.
-
-    The rays come from the whole mirror, so the aperture's edge is blurred.
-    """
-    ax, ay, az = aperture[0] - row[0], aperture[1] - row[1], aperture[2] - row[2]
-    nx = aperture[4] * aperture[8] - aperture[5] * aperture[7]
-    ny = aperture[5] * aperture[6] - aperture[3] * aperture[8]
-    nz = aperture[3] * aperture[7] - aperture[4] * aperture[6]
-    along = x * nx + y * ny + z * nz
-    if along == 0.0:
-        return 0.0
-    t = (ax * nx + ay * ny + az * nz) / along
-    if t <= 0.0 or t >= 1.0:
-        return 0.0
-    px, py, pz = t * x - ax, t * y - ay, t * z - az
-    blur = (1.0 - t) * math.sqrt(row[12] * row[13] / 3.0) + 1e-9
-    share = 1.0
-    for e in range(2):
-        at = px * aperture[3 + 3 * e] + py * aperture[4 + 3 * e] + pz * aperture[5 + 3 * e]
-        half, root = aperture[9 + e], math.sqrt(2.0) * blur
-        share *= 0.5 * (math.erf((half - at) / root) + math.erf((half + at) / root))
-    return share
-
-
-@njit(**OPTIONS)
-def hide(first, last, ways, cells, corners, hidden):
-    """Mark the cells that other triangles (C, 3, 3) hide from light along ``ways[first:last]``."""
-    for d in range(first, last):
-        way = ways[d]
-        for k in range(len(cells)):
-            hidden[d, k] = False
-            if _of(way, cells[k], 3) >= 0.0:
-                hidden[d, k] = True
-                continue
-            for j in range(len(corners)):
-                if j != k and _meets(cells[k], way, corners[j]):
-                    hidden[d, k] = True
-                    break
-
-
-@njit(**INNER)
-def _meets(cell, way, triangle):
-    """Whether the ray from a cell, against the light, meets a triangle (Möller and Trumbore)."""
-    a, b = triangle[1] - triangle[0], triangle[2] - triangle[0]
-    x, y, z = -way[0], -way[1], -way[2]
-    px, py, pz = y * b[2] - z * b[1], z * b[0] - x * b[2], x * b[1] - y * b[0]
-    det = a[0] * px + a[1] * py + a[2] * pz
-    if abs(det) < 1e-14:
-        return False
-    tx, ty, tz = cell[0] - triangle[0, 0], cell[1] - triangle[0, 1], cell[2] - triangle[0, 2]
-    u = (tx * px + ty * py + tz * pz) / det
-    if u < 0.0 or u > 1.0:
-        return False
-    qx, qy, qz = ty * a[2] - tz * a[1], tz * a[0] - tx * a[2], tx * a[1] - ty * a[0]
-    v = (x * qx + y * qy + z * qz) / det
-    if v < 0.0 or u + v > 1.0:
-        return False
-    return (b[0] * qx + b[1] * qy + b[2] * qz) / det > 1e-9

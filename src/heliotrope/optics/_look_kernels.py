@@ -129,7 +129,7 @@ def look(first, last, looks, mirrors, sun, light, slopes, pointing, sums, parts,
         uu, uv, vv = _blur(row, sun, cosine, axes, slopes[i], pointing[i], turn)
         sigma = t * math.sqrt(0.5 * (uu + vv) + total)
         count, _ = _images(
-            i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, images, work
+            i, row, sun, ray, axes, cosine, t, t, sigma, parts, surfaces, moments, images, work
         )
         visible = _columns(row, ray, axes, t, shape, columns, facing)
         if not visible:
@@ -193,7 +193,7 @@ def spread(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts
         uu, uv, vv = _blur(row, sun, cosine, axes, slopes[i], pointing[i], turn)
         sigma = t * math.sqrt(0.5 * (uu + vv) + total)
         count, _ = _images(
-            i, row, sun, ray, axes, cosine, t, sigma, parts, surfaces, moments, images, work
+            i, row, sun, ray, axes, cosine, t, t, sigma, parts, surfaces, moments, images, work
         )
         visible = _columns(row, ray, axes, t, shape, columns, facing)
         if not visible:

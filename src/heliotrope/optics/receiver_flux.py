@@ -13,6 +13,7 @@ mirrors, and differences in distance within one mirror. The sun's sum of Gaussia
 blur of at least 0.5 mrad from slope and calibration errors.
 """
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,6 +24,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, reflect
 from heliotrope.jit import as_input
+from heliotrope.optics import _cell_kernels as cell_kernels
 from heliotrope.optics import _image_kernels as kernels
 from heliotrope.optics import _look_kernels as look_kernels
 from heliotrope.optics.attenuation import air_model
@@ -43,6 +45,9 @@ _BLOCKS = 8
 LEAST = 5e-4
 #: Difference of directions below which mirrors see the same cells of a mesh, rad.
 _ALIKE = np.radians(5.0)
+
+#: What `_spread` returns.
+Spread = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +265,8 @@ class FieldFlux:
         groups
             Number of each mirror's group, 0 to G − 1, (H,).
         worth
-            Weight of the variance, (rows, columns), in any unit per (W/m²)².
+            Weight of the variance, (rows, columns), in any unit per (W/m²)². On a mesh and in a
+            cavity, (C,) takes the place of (rows, columns).
 
         Returns
         -------
@@ -273,24 +279,16 @@ class FieldFlux:
         -----
         The result is correct to first order in the errors.
         """
-        plan, errors = self._in_columns(), (as_float(scatter), as_input(modes), as_input(worth))
-        return plan.spread(self._field(), errors, groups)[:3]
+        errors = (as_float(scatter), as_input(modes), as_input(worth))
+        return self._plans[0].spread(self._field(), errors, groups)[:3]
 
     def power_slope(self) -> FloatArray:
         """Return how a displacement of each mirror's beam changes its power on the first surface.
 
         The result is the derivative with respect to a displacement to the right and up, as seen
-        from the mirror, W/rad, (H, 2).
-
-        Raises
-        ------
-        InputError
-            If the surface is a mesh or a cavity.
+        from the mirror, W/rad, (H, 2). The power of a cavity is the power into its aperture.
         """
-        plan, count = self._in_columns(), len(self.scene.mirrors)
-        none = (np.zeros((count, 2, 2)), np.zeros((count, 0, 2)), np.zeros(self._flux[0].shape))
-        groups = np.arange(count) * _BLOCKS // count
-        return plan.spread(self._field(), none, groups)[3]
+        return self._plans[0].power_slope(self._field())
 
     def on(self, surface: int) -> "FieldFlux":
         """Return the same flux with one of the surfaces as the first and only surface."""
@@ -429,31 +427,16 @@ class _Grid:
         boxes[:, 2] -= most
         return Images(values, begins, boxes, looks, (rows, wide), area)
 
-    def spread(
-        self, field: Any, errors: tuple[FloatArray, ...], groups: IntArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return variances, changes of the flux, weighted variances and derivatives of the power.
+    def spread(self, field: Any, errors: tuple[FloatArray, ...], groups: IntArray) -> Spread:
+        """See `_spread`."""
+        given = (self._shape, self._columns, self._grid)
+        cells = (self._grid[2], len(self._columns[0]))
+        return _spread(look_kernels.spread, (*field, *given), cells, errors, groups)
 
-        See `FieldFlux.spread` and `FieldFlux.power_slope`.
-        """
-        scatter, modes, worth = errors
-        rows, wide = self._grid[2], len(self._columns[0])
-        count, order = int(groups.max(initial=0)) + 1, np.argsort(groups, kind="stable")
-        edges = np.searchsorted(groups[order], np.arange(count + 1))
-        factor = as_input(_root(scatter))
-        own, value = np.zeros((count, rows, wide)), np.zeros(len(groups))
-        slope = np.zeros((len(groups), 2))
-        shared = np.zeros((count, modes.shape[1], rows, wide))
-
-        def block(first: int, last: int) -> None:
-            for k in range(first, last):
-                look_kernels.spread(
-                    edges[k], edges[k + 1], order, *field, self._shape, self._columns, self._grid,
-                    factor, modes, worth, own[k], shared[k], value, slope,
-                )  # fmt: skip
-
-        run_blocks(block, count, 2)
-        return as_float(own.sum(axis=0)), shared, value, slope
+    def power_slope(self, field: Any) -> FloatArray:
+        """See `FieldFlux.power_slope`."""
+        errors, groups = _no_errors(len(field[0]), (self._grid[2], len(self._columns[0])))
+        return self.spread(field, errors, groups)[3]
 
 
 class _Cells:
@@ -484,7 +467,7 @@ class _Cells:
 
         def block(first: int, last: int) -> None:
             for k in range(first, last):
-                kernels.cast_cells(
+                cell_kernels.cast_cells(
                     edges[k], edges[k + 1], rows, *field, self._middle, self._cells, self._hidden,
                     self._group, self._aperture, sign, sums[k], power,
                 )  # fmt: skip
@@ -494,6 +477,56 @@ class _Cells:
         if self._front is not None:
             # The power that enters the aperture, whether or not it reaches cells.
             self._front(rows, edges, field, sign, self._seen, power)
+
+    def spread(self, field: Any, errors: tuple[FloatArray, ...], groups: IntArray) -> Spread:
+        """See `_spread`; the power is that of the light that reaches cells."""
+        given = (self._middle, self._cells, self._hidden, self._group, self._aperture)
+        cells = (len(self._cells),)
+        return _spread(cell_kernels.spread_cells, (*field, *given), cells, errors, groups)
+
+    def power_slope(self, field: Any) -> FloatArray:
+        """See `FieldFlux.power_slope`."""
+        if self._front is not None:
+            return self._front.power_slope(field)
+        errors, groups = _no_errors(len(field[0]), (len(self._cells),))
+        return self.spread(field, errors, groups)[3]
+
+
+def _spread(
+    kernel: Callable[..., None],
+    given: tuple[Any, ...],
+    cells: tuple[int, ...],
+    errors: tuple[FloatArray, ...],
+    groups: IntArray,
+) -> Spread:
+    """Return variances, changes of the flux, weighted variances and derivatives of the power.
+
+    ``given`` is what the kernel needs of the field and the surface, whose cells have the shape
+    ``cells``. See `FieldFlux.spread` and `FieldFlux.power_slope`.
+    """
+    scatter, modes, worth = errors
+    count, order = int(groups.max(initial=0)) + 1, np.argsort(groups, kind="stable")
+    edges = np.searchsorted(groups[order], np.arange(count + 1))
+    factor = as_input(_root(scatter))
+    own, value = np.zeros((count, *cells)), np.zeros(len(groups))
+    slope = np.zeros((len(groups), 2))
+    shared = np.zeros((count, modes.shape[1], *cells))
+
+    def block(first: int, last: int) -> None:
+        for k in range(first, last):
+            kernel(
+                edges[k], edges[k + 1], order, *given, factor, modes, worth, own[k], shared[k],
+                value, slope,
+            )  # fmt: skip
+
+    run_blocks(block, count, 2)
+    return as_float(own.sum(axis=0)), shared, value, slope
+
+
+def _no_errors(count: int, cells: tuple[int, ...]) -> tuple[tuple[FloatArray, ...], IntArray]:
+    """Return errors of 0 for a number of mirrors and for all cells, and blocks of mirrors."""
+    none = (np.zeros((count, 2, 2)), np.zeros((count, 0, 2)), np.zeros(cells))
+    return none, np.arange(count) * _BLOCKS // count
 
 
 def _hidden(
@@ -514,7 +547,7 @@ def _hidden(
     first = np.array([ways[group == k].mean(axis=0) for k in range(len(names))])
     hidden = np.zeros((len(names), len(cells)), dtype=np.bool_)
     corners = as_input(mesh.corners)
-    run_blocks(lambda a, b: kernels.hide(a, b, first, cells, corners, hidden), len(names), 2)
+    run_blocks(lambda a, b: cell_kernels.hide(a, b, first, cells, corners, hidden), len(names), 2)
     return hidden, group
 
 

@@ -2,8 +2,8 @@
 
 Every mirror is in the pose that its reported step counts yield under its present calibration, so
 heliostats that are turned away or at stow shade and block in those poses.
-`heliotrope.optics.receiver_flux` computes the flux, and `heliotrope.aims.errors` its uncertainty
-from the covariance of each calibration. Both are computed outside the plant's event loop
+`heliotrope.optics.receiver_flux` computes the flux, and its uncertainty from the covariance of each
+calibration. Both are computed outside the plant's event loop
 (`plant.workers`) on request.
 """
 
@@ -12,15 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from heliotrope.aims.errors import assess
 from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.optics import (
-    Cavity,
     FieldFlux,
     FieldOptics,
     FluxView,
-    Mesh,
     Mirrors,
     Scene,
     flux_views,
@@ -159,23 +156,21 @@ def predicted(scene: Scene, light: FieldOptics) -> list[PredictedView]:
 
 
 def _uncertain(view: FluxView, engine: FieldFlux) -> PredictedView:
-    flux, (surface,) = view.flux, engine.scene.surfaces
-    sigma, power_sigma = np.full(flux.shape, np.nan), float("nan")
-    if not isinstance(surface, Mesh | Cavity):
-        mirrors = engine.scene.mirrors
-        count, pointing = len(mirrors), mirrors.pointing
-        # A beam whose error is larger than its image remains just as sharp: its power is either on
-        # the surface or off it, and the derivatives of a blurred image do not describe any cell.
-        image = SUN_SIGMA**2 + 4.0 * mirrors.slope**2
-        wide = 0.5 * np.trace(pointing, axis1=1, axis2=2) > image
+    flux, mirrors = view.flux, engine.scene.mirrors
+    sigma, count, pointing = np.full(flux.shape, np.nan), len(mirrors), mirrors.pointing
+    # A beam whose error is larger than its image remains just as sharp: its power is either on the
+    # surface or off it, and the derivatives of a blurred image do not describe any cell.
+    image = SUN_SIGMA**2 + 4.0 * mirrors.slope**2
+    wide = 0.5 * np.trace(pointing, axis1=1, axis2=2) > image
+    if engine.power[wide].sum() <= WIDE * engine.power.sum():
         alone, together = np.zeros((count, 0, 2)), np.zeros(count, dtype=np.int64)
-        no_limit = np.full(flux.shape, np.inf)
-        if engine.power[wide].sum() <= WIDE * engine.power.sum():
-            sigma = assess(engine, alone, together, 0.5, no_limit, 1.0).sigma
-        slope = engine.power_slope()
-        variance = np.einsum("hi,hij,hj->h", slope, pointing, slope)
-        either = engine.power * (engine.leaving - engine.power)
-        power_sigma = float(np.sqrt(np.where(wide, either, variance).sum()))
+        no_weight = np.zeros(engine.maps[0].shape)
+        variance, _, _ = engine.spread(pointing, alone, together, no_weight)
+        sigma = np.sqrt(variance).reshape(flux.shape)
+    slope = engine.power_slope()
+    known = np.einsum("hi,hij,hj->h", slope, pointing, slope)
+    either = engine.power * (engine.leaving - engine.power)
+    power_sigma = float(np.sqrt(np.where(wide, either, known).sum()))
     hottest = np.unravel_index(flux.argmax(), flux.shape)
     return PredictedView(
         **vars(view),

@@ -265,7 +265,7 @@ class PredictedView(FluxView):
     Attributes
     ----------
     sigma
-        Standard deviation in each cell, W/m², (H, W); NaN on a mesh and in a cavity.
+        Standard deviation in each cell, W/m², (H, W); NaN while many beams are uncalibrated.
     power_sigma
         Standard deviation of the power, W.
     peak, peak_sigma
