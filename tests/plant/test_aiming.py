@@ -4,7 +4,6 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,12 +12,11 @@ from heliotrope.errors import InputError
 from heliotrope.field.aim_settings import AimSettings
 from heliotrope.field.flux_limit import FluxLimit
 from heliotrope.field.layouts import lay_out
-from heliotrope.geometry import FloatArray, as_float
+from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.optics.receiver_flux import FieldFlux
 from heliotrope.optics.surfaces import surface_of
-from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import DNI_READING
 from heliotrope.plant.operations import aiming
 from heliotrope.plant.operations.automatic import AutomaticSettings
@@ -26,7 +24,6 @@ from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.workers import at_once
 from heliotrope.twin.sensors import FluxSensor
-from support.flux_account import FluxAccount
 from support.live import LiveOptions, LivePlant, play
 
 COUNT = 6
@@ -360,48 +357,3 @@ def texts(made: LivePlant, condition: str, *, active: bool = False) -> list[str]
     """Return the texts of the alarms of a condition."""
     alarms = made.operations.logbook.alarms()
     return [a.text for a in alarms if a.condition == condition and a.active >= active]
-
-
-def _limit_ignored(patch: pytest.MonkeyPatch) -> None:
-    allowed = aiming.Aiming._allowed
-
-    def twice(self: Any, limit: FluxLimit, scene: Any) -> FluxLimit:
-        found = allowed(self, limit, scene)
-        return FluxLimit(2.0 * as_float(found.flux), found.margin)
-
-    patch.setattr(aiming.Aiming, "_allowed", twice)
-
-
-def _own_aims(patch: pytest.MonkeyPatch) -> None:
-    aim = PlantController.aim
-
-    def lower(self: Any, person: Person, token: int, points: Any) -> Any:
-        return aim(self, person, token, {k: p - [0.0, 0.0, 0.3] for k, p in points.items()})
-
-    patch.setattr(PlantController, "aim", lower)
-
-
-@pytest.mark.parametrize(
-    ("defect", "finding"), [(None, ""), (_limit_ignored, "flux:"), (_own_aims, "aim:")]
-)
-def test_the_invariants_hold_and_find_a_planted_defect(
-    defect: Callable[[pytest.MonkeyPatch], None] | None,
-    finding: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    account = FluxAccount(LIMIT)
-    if defect is not None:
-        defect(monkeypatch)
-
-    async def scene(made: LivePlant) -> None:
-        made.operations._aiming._worker = account.work
-        for _ in range(20):
-            account.look(made.plant, true_flux(made))
-            await asyncio.sleep(5.0)
-
-    played(scene)
-    if finding:
-        assert account.broken
-        assert all(text.startswith(finding) for text in account.broken), account.broken
-    else:
-        assert account.broken == []
