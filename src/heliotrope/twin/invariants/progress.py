@@ -234,6 +234,18 @@ class ProgressObserver(Judge):
                 saw = f"no visit is under way, and its beam has been on {target.name}"
                 key = ("left", name, target.name)
                 self._within(key, lights, now, LEFT_WITHIN, name, saw)
+        self._idle(operations, working, running, now)
+        self._measures(operations, working, may=may, now=now)
+
+    def _idle(
+        self,
+        operations: Operations,
+        working: Sequence[str],
+        running: Sequence[Running],
+        now: float,
+    ) -> None:
+        """Check that no target is free for long while a heliostat is ready for it."""
+        visited = {name for run in running for name in run.heliostats}
         busy = {run.target for run in running}
         results = operations.automatic.view().results
         # After a failure it rests for longer than a day of "days"; one taken out has not failed.
@@ -249,7 +261,6 @@ class ProgressObserver(Judge):
                 free = ready and place not in busy
                 saw = f"{place} has been free, and it ready for a visit"
                 self._within(("idle", name, place), free, now, limit, name, saw)
-        self._measures(operations, working, may=may, now=now)
 
     def _high(self, sun: FloatArray) -> bool:
         """Return whether the field should be up: the sun was high enough, and has not set since."""
