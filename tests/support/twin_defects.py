@@ -29,6 +29,7 @@ from heliotrope.twin.world.crew import CrewAct
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.simulation import RunPlan
 from support import (
+    aim_defects,
     day_defects,
     plant_defects,
     quiet_defects,
@@ -446,6 +447,8 @@ DEFECTS = (
       for name, defect, worlds, slow in quiet_defects.REJOIN_ROWS),
     *(Defect(numbers, name, defect, only, pause, worlds=worlds, slow=slow)
       for numbers, name, defect, only, pause, worlds, slow in report_defects.ROWS),
+    *(Defect((number,), name, defect, faults=faults, seconds=300.0, worlds=("limit",), first=first)
+      for number, name, defect, faults, first in aim_defects.ROWS),
     *(Defect((11, 12), name, defect, faults=(), worlds=("tour",), slow=slow)
       for name, defect, slow in quiet_defects.TOUR_ROWS),
 )  # fmt: skip

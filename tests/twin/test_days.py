@@ -78,7 +78,7 @@ def test_on_some_days_a_mirror_is_covered() -> None:
 
 def test_people_call_invariants_of_liveness_by_their_names() -> None:
     assert [named(number) for number in TITLES] == [
-        *map(str, range(1, 18)), "L1", "L2", "L3", "L4"
+        *map(str, range(1, 20)), "L1", "L2", "L3", "L4"
     ]  # fmt: skip
     assert str(Violation(L2, 3.0, "H1", "so")).startswith("invariant L2 (each ticket")
 

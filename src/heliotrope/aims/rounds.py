@@ -161,6 +161,11 @@ class Answer:
 _last: list[tuple[float, Mask, SceneAims]] = []
 
 
+def forget() -> None:
+    """Forget the last aims computed in this process, as a new process does."""
+    _last.clear()
+
+
 def next_round(now: Round, **light: Any) -> Answer:
     """Return the moves that bring the mirrors closer to the aims of maximum power.
 

@@ -66,7 +66,7 @@ def simulate(
 ) -> None:
     """Run the real plant, clusters and local controllers in virtual time, with random faults.
 
-    Seventeen safety invariants and four liveness invariants are checked; the exit code is 1 if one
+    Nineteen safety invariants and four liveness invariants are checked; the exit code is 1 if one
     is violated.
     """
     from heliotrope.files.text import write_text

@@ -270,9 +270,9 @@ class Aiming:
             self._good_at = now  # no heliostat may be moved, so no aims are late
             return
         try:
-            answer = await asyncio.wait_for(
-                self._worker(next_round, present), self._settings.deadline
-            )
+            # `asyncio.wait_for` of Python 3.11 may ignore that the program ends.
+            async with asyncio.timeout(self._settings.deadline):
+                answer = await self._worker(next_round, present)
         except TimeoutError:
             await self._failed(f"no answer within {self._settings.deadline:g} s")
         except HeliotropeError as error:

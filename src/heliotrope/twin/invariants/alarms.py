@@ -37,7 +37,8 @@ BY_FAULTS = {
 }  # fmt: skip
 #: Alarms that operators, weather, wrong parameters and automatic control cause.
 BY_OTHERS = frozenset({
-    "authority_lost", "firmware_differs", "heliostat_unlisted", "not_parked", "sun_contradicted",
+    "aims", "authority_lost", "firmware_differs", "flux_above_limit", "heliostat_unlisted",
+    "not_parked", "sun_contradicted",
     "unwitnessed", "beam_blocked", "beam_disproved", "beam_unsent", "counts_doubtful",
     "flux_after_emergency",
     "identity", "keep_out_predicted", "nodes_unacknowledged", "operator_emergency",
@@ -185,7 +186,7 @@ class AlarmObserver(Judge):
             for name, some in self._clusters.items()
         }
         rests |= {written: rest[name] for name, written in files.items() if written}
-        rests[""] = max(rest.values())
+        rests[""] = rests["receiver"] = max(rest.values())
         new, self._new = self._new, []
         if runs:
             self._began_at = min(self._began_at, now)

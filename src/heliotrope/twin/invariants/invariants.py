@@ -1,4 +1,4 @@
-"""The seventeen safety invariants, and an independent observer of the first eleven.
+"""The nineteen safety invariants, and an independent observer of the first eleven.
 
 The observer sees the frames on the bus, the actions of each board, and the messages to and from the
 plant. It keeps its own accounts in true time and trusts no report: a sun vector's age counts from
@@ -39,6 +39,9 @@ number    check
           have causes, and causes have alarms; each command ends, and a failed one says why.
 17        An operator's order or lock stands until its owner, or an engineer by name, has ended
           it: the emergency stays in force, and the locked heliostat stands still.
+18        Under a flux limit, the true flux stays below the limit; after a disturbance it is below
+          the limit again within 60 s.
+19        Under a flux limit, each aim comes from the optimiser, its fallback or a person.
 ========  ============================================================================
 
 Besides being safe, the plant must keep working:
@@ -54,7 +57,8 @@ L4        Emergencies and locks survive a restart of the plant program.
 ========  ============================================================================
 
 `twin.invariants.beams` checks 12 to 15, `twin.invariants.quiet`, `.visits`, `.day`, `.alarms` and
-`.tickets` check 16, `twin.invariants.persons` checks 17, and `twin.invariants.answers` checks 11.
+`.tickets` check 16, `twin.invariants.persons` checks 17, `twin.invariants.flux` checks 18 and 19,
+and `twin.invariants.answers` checks 11.
 """
 
 from collections import Counter, deque
@@ -97,19 +101,21 @@ TITLES = {
     15: "a proof counts only what is known",
     16: "work that is possible is done, and what is shown is true",
     17: "what a person has ordered or locked stands",
-    18: "what was taken is given back",
-    19: "each ticket and each retry ends, truthfully",
-    20: "every healthy mirror tracks again",
-    21: "what holds for safety outlives a restart",
+    18: "the true flux holds the limit",
+    19: "each aim has an origin",
+    20: "what was taken is given back",
+    21: "each ticket and each retry ends, truthfully",
+    22: "every healthy mirror tracks again",
+    23: "what holds for safety outlives a restart",
 }
-#: Number of the invariant about operators' orders and locks; numbers of the liveness invariants,
-#: which are called by name.
-WORDS = 17
-L1, L2, L3, L4 = 18, 19, 20, 21
+#: Numbers of the invariants about operators' orders and locks, the flux, and the origin of aims;
+#: numbers of the liveness invariants, which are called by name.
+WORDS, FLUX, ORIGIN = 17, 18, 19
+L1, L2, L3, L4 = 20, 21, 22, 23
 
 
 def named(number: int) -> str:
-    """Return the short name of an invariant: 1 to 17, L1 to L4."""
+    """Return the short name of an invariant: 1 to 19, L1 to L4."""
     return str(number) if number < L1 else f"L{number - L1 + 1}"
 
 
@@ -202,7 +208,7 @@ class Violation:
     Attributes
     ----------
     number
-        Of `TITLES`: 1 to 17, or `L1` to `L4`.
+        Of `TITLES`: 1 to 19, or `L1` to `L4`.
     at
         Time since the start, s.
     subject

@@ -77,6 +77,8 @@ class ProgressObserver(Judge):
     dark
         Heliostats whose beams no camera sees, because the plant file is so wrong about them that
         their beams miss the receiver and the targets, or because the mirror is covered.
+    limited
+        Whether a flux limit may keep heliostats at standby while others track the receiver.
 
     """
 
@@ -90,6 +92,7 @@ class ProgressObserver(Judge):
         across: bool,
         lowest: float = LOWEST,
         dark: Collection[str] = (),
+        limited: bool = False,
     ) -> None:
         super().__init__(start)
         self._targets = {target.name: target for target in targets}
@@ -98,7 +101,7 @@ class ProgressObserver(Judge):
         self._assigned: set[str] = set()
         self._out: dict[str, float] = {}
         self._since: dict[tuple[str, ...], float] = {}
-        self._lowest, self._dark = lowest, frozenset(dark)
+        self._lowest, self._dark, self._limited = lowest, frozenset(dark), limited
         self._up: bool | None = None
         self._locked: set[str] = set()
         self._calibrates, self._measured = True, 0.0
@@ -205,6 +208,10 @@ class ProgressObserver(Judge):
         may &= not operations.plant.sentinel.on
         self._owned(visited, quiet, now)
         working = [name for name in self._assigned & quiet if may and name not in self._out]
+        lit = self._limited and any(
+            board.state == states.TRACKING and board.miss(sun, RECEIVER) <= OFF
+            for board in self._boards.values()
+        )
         for name, board in self._boards.items():
             mine = name in working and name not in visited
             self._within(
@@ -219,13 +226,26 @@ class ProgressObserver(Judge):
             tracks = board.state == states.TRACKING and on_receiver
             saw = "automatic control has it, and it has not tracked the receiver"
             locked = name in self._locked and board.state == states.LOCKED
-            away = mine and not tracks and not locked  # the person gives the lock back
+            rests = lit and board.state == states.IDLE
+            away = mine and not (tracks or rests or locked)  # the person gives the lock back
             self._within(("tracks", name), away, now, TRACKS_WITHIN, name, saw, L3)
             for target in self._targets.values():
                 lights = mine and board.state == states.TRACKING and self._on(board, target, sun)
                 saw = f"no visit is under way, and its beam has been on {target.name}"
                 key = ("left", name, target.name)
                 self._within(key, lights, now, LEFT_WITHIN, name, saw)
+        self._idle(operations, working, running, now)
+        self._measures(operations, working, may=may, now=now)
+
+    def _idle(
+        self,
+        operations: Operations,
+        working: Sequence[str],
+        running: Sequence[Running],
+        now: float,
+    ) -> None:
+        """Check that no target is free for long while a heliostat is ready for it."""
+        visited = {name for run in running for name in run.heliostats}
         busy = {run.target for run in running}
         results = operations.automatic.view().results
         # After a failure it rests for longer than a day of "days"; one taken out has not failed.
@@ -241,7 +261,6 @@ class ProgressObserver(Judge):
                 free = ready and place not in busy
                 saw = f"{place} has been free, and it ready for a visit"
                 self._within(("idle", name, place), free, now, limit, name, saw)
-        self._measures(operations, working, may=may, now=now)
 
     def _high(self, sun: FloatArray) -> bool:
         """Return whether the field should be up: the sun was high enough, and has not set since."""
@@ -313,7 +332,7 @@ class ProgressObserver(Judge):
         remaining = [name for name in working if name not in done and beliefs.record(name) is None]
         last = max((result.at for result in results if result.new), default=0.0)
         fresh, self._measured = last > self._measured, max(last, self._measured)
-        holds = may and bool(remaining) and self._calibrates and not fresh
+        holds = may and bool(remaining and self._targets) and self._calibrates and not fresh
         saw = f"{len(remaining)} heliostats are not calibrated, and no visit has measured any"
         self._within(("measured",), holds, now, MEASURED_WITHIN, "automatic control", saw)
 

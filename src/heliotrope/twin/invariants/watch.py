@@ -1,11 +1,14 @@
 """The observers of automatic control in a run, and the operators' reports that they need."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy.typing as npt
 
 from heliotrope.plant.operations import Operations
 from heliotrope.plant.orders.authority import Person
 from heliotrope.twin.invariants.day import DayObserver
+from heliotrope.twin.invariants.flux import FluxObserver
 from heliotrope.twin.invariants.invariants import Judge
 from heliotrope.twin.invariants.progress import ProgressObserver
 from heliotrope.twin.invariants.results import ResultObserver
@@ -15,18 +18,23 @@ from heliotrope.twin.invariants.visits import VisitObserver
 
 @dataclass(frozen=True)
 class Watch:
-    """The observers of automatic control and of what the plant displays about it."""
+    """The observers of automatic control and of what the plant displays about it.
+
+    ``flux`` is None if the plant has no flux limit.
+    """
 
     visits: VisitObserver
     day: DayObserver
     results: ResultObserver
     progress: ProgressObserver
     shown: ShownObserver
+    flux: FluxObserver | None = None
 
     @property
     def each(self) -> tuple[Judge, ...]:
         """All observers, in the order in which their hooks are called."""
-        return self.visits, self.day, self.results, self.progress, self.shown
+        each = self.visits, self.day, self.results, self.progress, self.shown
+        return each if self.flux is None else (*each, self.flux)
 
     # -- reports of operators -------------------------------------------------------------------
 
@@ -44,9 +52,17 @@ class Watch:
         self.day.taken(heliostats)
         self.progress.taken(heliostats)
 
+    def aimed(self, points: Mapping[str, npt.ArrayLike]) -> None:
+        """Record aims that an operator gives, ENU, m, (3,), by heliostat."""
+        if self.flux is not None:
+            self.flux.aimed(points)
+            self.flux.commanded("AIM")
+
     def commanded(self, what: str, heliostats: Sequence[str]) -> None:
         """Record an operator command that the plant has accepted."""
         self.progress.commanded(what, heliostats)
+        if self.flux is not None:
+            self.flux.commanded(what)
 
     def asked(self, heliostats: Sequence[str]) -> None:
         """Record that an operator requests the calibration of heliostats now."""

@@ -277,6 +277,8 @@ class Acts:
             name: tuple(x + self.chance.uniform(-_BESIDE, _BESIDE) for x in about) for name in names
         }
         self._watch.taken(names)
+        if what == "AIM":
+            self._watch.aimed(chosen)
         self.accepted(person, token, gives(person, token, chosen), what)
 
     def parameters(self, operations: Operations, person: Person, token: int) -> None:

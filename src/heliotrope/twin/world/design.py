@@ -5,13 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from heliotrope.field.aim_settings import AimSettings
 from heliotrope.field.coded_visits import JointSettings, ReceiverSettings
+from heliotrope.field.flux_limit import FluxLimit
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.layout_tower import watching_camera
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver
 from heliotrope.field.volumes import Sphere
+from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.board_items import Wanted, items_of
+from heliotrope.optics.plant_scene import scene_of
+from heliotrope.optics.receiver_flux import FieldFlux
 from heliotrope.twin.boards.outfit import RECEIVER, Outfit, mechanisms
 from heliotrope.twin.world.scene import Scene
 
@@ -19,6 +24,10 @@ from heliotrope.twin.world.scene import Scene
 MIRROR = 2.0
 #: Settings of joint visits and receiver visits for a small field and a run of some minutes.
 JOINT = JointSettings(least=3, first=8)
+#: Aims under a flux limit for a small field: the limit over the peak of all beams in the middle,
+#: and rounds in which one beam at a time moves.
+LIMIT_OF_PEAK = 0.6
+AIMS = AimSettings(probability=0.95, moves=4.0, together=1, every=15.0)
 _EYE = "below"
 RECEIVER_VISITS = ReceiverSettings(_EYE, "receiver", least=2, known=0.01, power=0.01, every=60.0)
 
@@ -71,6 +80,21 @@ def design_of(
         joint_visits=JOINT if together else None,
         receiver_visits=RECEIVER_VISITS if together else None,
     )
+
+
+def limited(design: Plant, sun: FloatArray) -> Plant:
+    """Return a plant with a flux limit, which all its beams in the receiver's middle would exceed.
+
+    Parameters
+    ----------
+    design
+        The plant, with one receiver.
+    sun
+        Direction to the sun, (3,).
+    """
+    scene = scene_of(design, sun, design.receivers[0].center, dni=AIMS.dni)
+    limit = FluxLimit(LIMIT_OF_PEAK * float(FieldFlux(scene).maps[0].max()), 0.05)
+    return replace(design, aims=replace(AIMS, strategy="limit", limit=limit))
 
 
 def wanted_of(fits: Sequence[Outfit]) -> Wanted:

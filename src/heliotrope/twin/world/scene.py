@@ -20,7 +20,7 @@ from heliotrope.twin.boards.outfit import (
     stow_beams,
 )
 from heliotrope.twin.invariants.invariants import OFF
-from heliotrope.twin.world.worlds import DAYS, drawn, works
+from heliotrope.twin.world.worlds import DAYS, LIMIT, drawn, works
 
 #: Minimum elevation of the sun at the start and end of a drawn scene, rad.
 _LOWEST = math.radians(8.0)
@@ -88,7 +88,7 @@ def scene_of(worlds: Sequence[str], seed: int, seconds: float, heliostats: int) 
 
     The scene of "days" has the usual places, and a sun that crosses the zenith.
     """
-    targets = TARGETS if works(worlds) else ()
+    targets = TARGETS if works(worlds) and LIMIT not in worlds else ()
     chance = random.Random(f"place {seed}")
     if DAYS in worlds:
         site, start, lowest = _short_day(chance, seconds)

@@ -8,6 +8,7 @@ the middle of a visit.
 
 import asyncio
 import contextlib
+import functools
 from dataclasses import dataclass
 
 from heliotrope.geometry import FloatArray
@@ -57,6 +58,8 @@ class Working:
         watch.visits.look(plant, sun, now)
         if quiet is None:
             return
+        if watch.flux is not None:
+            watch.flux.look(None if waits else plant, sun, now, governs=governs)
         watch.day.look(plant, quiet, sun, now)
         watch.results.look(operations, now)
         watch.progress.look(operations, quiet, sun, now, governs=governs)
@@ -72,10 +75,12 @@ class Shift:
         The actions available to the operators.
     pause
         Mean time between two interruptions, s.
+    aims
+        Whether operators on duty also choose aims on the receiver.
     """
 
-    def __init__(self, acts: Acts, pause: float) -> None:
-        self._acts, self._pause = acts, pause
+    def __init__(self, acts: Acts, pause: float, *, aims: bool = False) -> None:
+        self._acts, self._pause, self._aims = acts, pause, aims
         self._chance = acts.chance
 
     async def work(self) -> None:
@@ -103,7 +108,11 @@ class Shift:
         await does(operations)
 
     async def _duty(self, operations: Operations) -> None:
-        await self._acts.duty(operations, ENGINEER, most=_DUTY, commands=self._acts.commands)
+        acts, commands = self._acts, self._acts.commands
+        if self._aims and self._chance.random() < 0.5:
+            name = self._chance.choice(acts.names)
+            commands = functools.partial(acts.points, names=(name,))
+        await acts.duty(operations, ENGINEER, most=_DUTY, commands=commands)
 
     async def _emergency(self, operations: Operations) -> None:
         self._acts.emergency(operations, VIEWER, Act.DEFOCUS)

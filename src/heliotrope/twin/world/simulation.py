@@ -48,6 +48,7 @@ from heliotrope.twin.cameras import FieldSnapshot
 from heliotrope.twin.invariants.alarms import AlarmObserver
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.day import DayObserver
+from heliotrope.twin.invariants.flux import FluxObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.panel import Panel
 from heliotrope.twin.invariants.persons import PersonsObserver
@@ -66,7 +67,7 @@ from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.acts import Acts
 from heliotrope.twin.world.crew import CREW, Crew, CrewAct
 from heliotrope.twin.world.damage import Damage
-from heliotrope.twin.world.design import MIRROR, design_of, wanted_of
+from heliotrope.twin.world.design import MIRROR, design_of, limited, wanted_of
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.instruments import READINGS, Instruments
 from heliotrope.twin.world.maintenance import Maintenance
@@ -82,6 +83,8 @@ from heliotrope.twin.world.worlds import (
     COARSE,
     COMMON,
     DAYS,
+    LIMIT,
+    LIMITED,
     PARTY,
     REPAIRS,
     Habits,
@@ -185,8 +188,9 @@ class RunPlan:
 
     @property
     def size(self) -> int:
-        """Number of heliostats, large enough for a joint visit if there are joint visits."""
-        return max(self.heliostats, PARTY) if joint_visits(self.worlds) else self.heliostats
+        """Number of heliostats, large enough for joint visits or a flux limit if there are any."""
+        least = PARTY if joint_visits(self.worlds) else LIMITED if LIMIT in self.worlds else 1
+        return max(self.heliostats, least)
 
     @property
     def clusters(self) -> int:
@@ -319,6 +323,8 @@ class Simulation:
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
         together = joint_visits(plan.worlds)
         self._design, self._homes = design_of(known, homes, scene, together=together), homes
+        if LIMIT in plan.worlds:
+            self._design = limited(self._design, self.sun(self.begin))
         # The boards' desired items and assigned points survive the plant's program.
         self._fits = known
         self._wanted = wanted_of(known) if knows_boards(plan.worlds) else Wanted()
@@ -416,14 +422,18 @@ class Simulation:
         lights, together = "lights" in plan.worlds, joint_visits(plan.worlds)
         kind = DAY_WORK if DAYS in plan.worlds else LIT_WORK if lights else USUAL_WORK
         kind = replace(kind, together=together, lowest=self._scene.lowest)
-        work = Work(plan.seed, sight, self._exits, kind)
-        watch = self._new_watch(work, together=together)
+        flux = None
+        if LIMIT in plan.worlds:
+            flux = FluxObserver(self.begin, self.boards, self._design)
+        work = Work(plan.seed, sight, self._exits, kind, flux)
+        watch = replace(self._new_watch(work, together=together), flux=flux)
         truth = {name: board.outfit.causes for name, board in boards.items()}
         acts = Acts(work, self.operator, watch, truth, clock, plan.seed)
         if DAYS in plan.worlds:
             crew = Crew(acts, self.boards, plan.seconds, rough=self._coarse, planned=plan.acts)
             return Working(work, crew, watch)
-        return Working(work, Shift(acts, PARTY_PAUSE if together else SHIFT_PAUSE), watch)
+        pause = PARTY_PAUSE if together else SHIFT_PAUSE
+        return Working(work, Shift(acts, pause, aims=flux is not None), watch)
 
     def _new_watch(self, work: Work, *, together: bool) -> Watch:
         begin, boards, targets = self.begin, self.boards, self._scene.targets
@@ -449,6 +459,7 @@ class Simulation:
                 across=drawn(self.plan.worlds),
                 lowest=lowest,
                 dark=dark,
+                limited=LIMIT in self.plan.worlds,
             ),
             ShownObserver(
                 begin, boards, self._homes, targets, self.observer, persons, self._unsurveyed

@@ -29,10 +29,12 @@ from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
 from heliotrope.plant.schedule.scheduler import VISITS, Scheduler
 from heliotrope.plant.visits import CalibrationCycle, Centring, CycleSettings, JointCycle
 from heliotrope.plant.visits.receiver_cycle import ReceiverCycle
+from heliotrope.plant.workers import at_once
 from heliotrope.safety import Alarm
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import PlannedVisit
 from heliotrope.twin.cameras import FieldSnapshot
+from heliotrope.twin.invariants.flux import FluxObserver
 from heliotrope.twin.world.photographs import LyingCamera
 
 #: Number of heliostats that may be lost together without an operator; a small field may have only
@@ -127,6 +129,8 @@ class Work:
         Closes the store at the end of the run.
     kind
         How automatic control works.
+    flux
+        Observer of the flux limit; None if there is none.
 
     Attributes
     ----------
@@ -147,11 +151,12 @@ class Work:
         sight: FieldSnapshot,
         exits: contextlib.ExitStack,
         kind: WorkKind,
+        flux: FluxObserver | None = None,
     ) -> None:
         # A stack of photographs distinguishes beams, as a search does.
         searches = random.Random(f"visits {seed}").random() < kind.searches
         self.centred = kind.together or searches
-        self._together, self._kind = kind.together, kind
+        self._together, self._kind, self._flux = kind.together, kind, flux
         self._settings = replace(SETTINGS, lowest=kind.lowest)
         waver = START_NOISE * VISIT.sigma
         self.camera = LyingCamera(sight, seed, kind.lies, waver, standing=kind.lights)
@@ -191,7 +196,10 @@ class Work:
         automatic = AutomaticControl(
             plant, self.logbook, visits, records=self.records, settings=self._settings
         )
-        self.operations = Operations(plant, self.logbook, automatic, records=self.records)
+        worker = at_once if self._flux is None else self._flux.worker(plant.field.names)
+        self.operations = Operations(
+            plant, self.logbook, automatic, records=self.records, worker=worker
+        )
         for name in plant.field.names:
             believed = plant.beliefs.present(name)[0]
             plant.wanted.set(name, items_of(believed, plant.design.machine(name)))

@@ -32,6 +32,7 @@ WORLDS = {
     "parties": "as visits, by the plant's own schedule: many at once on a target and the receiver",
     "repairs": "boards, files and stores are exchanged for wrong ones, drives stall, persons lock",
     "common": "plant and clusters begin with the same wrong time, which a sun sensor contradicts",
+    "limit": "automatic control aims under a flux limit, without calibration targets",
     "days": "as parties, from morning to evening stow: several persons act at any stage of a visit",
 }
 #: A short working day, and its length, s.
@@ -40,8 +41,10 @@ DAYS, DAY = "days", 840.0
 REPAIRS, COMMON = "repairs", "common"
 #: Worlds in which only their own faults occur.
 OWN_FAULTS = frozenset({DAYS, REPAIRS})
+#: Automatic control under a flux limit, and its minimum number of heliostats.
+LIMIT, LIMITED = "limit", 4
 #: Worlds with automatic control.
-WORKING = ("visits", "day", "lights", "parties", DAYS)
+WORKING = ("visits", "day", "lights", "parties", LIMIT, DAYS)
 #: Worlds with joint visits and receiver visits, and their minimum number of heliostats.
 PARTIES, PARTY = ("parties", DAYS), 6
 #: Worlds in which site, date, hour, and places are drawn.

@@ -1,0 +1,179 @@
+"""The observer of a flux limit: the true flux on the receiver, and the origin of each aim.
+
+It computes the flux from the true mirrors and the true sun, at the irradiance for which the limit
+must hold. It reads the answers of the plant's optimiser where they leave the plant's worker, and
+the aims of persons where they are given.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from math import inf
+from typing import TypeVar, TypeVarTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.aims.rounds import Answer, forget
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray, as_float, normalize
+from heliotrope.lcu import states
+from heliotrope.optics import Mirrors, Scene, surface_of
+from heliotrope.optics.plant_scene import shaped
+from heliotrope.optics.receiver_flux import FieldFlux
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.workers import Worker, at_once
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.outfit import RECEIVER
+from heliotrope.twin.invariants.invariants import FLUX, OFF, ORIGIN, Judge
+
+T = TypeVar("T")
+Given = TypeVarTuple("Given")
+#: Aims closer together than this are the same, m.
+SAME = 0.05
+#: Time between two computations of the true flux, s.
+EVERY = 2.0
+#: Time for which the true flux may be above the limit, s: as long as the drives need for a move, or
+#: some rounds if a person has aimed a beam, or a beam was astray, within that longer time.
+AT_ONCE, BELOW_WITHIN = 5.0, 60.0
+#: Distance from its aim, m, and time, s, from which a beam is astray: several times the play of the
+#: gears, and longer than the way from standby.
+ASTRAY, TOO_LONG = 0.3, 3.0
+#: Commands by which a person brings light to the receiver.
+LIGHTS = ("TRACK", "REFOCUS", "AIM")
+
+
+class FluxObserver(Judge):
+    """Checks that the true flux holds the limit (18), and that each aim has an origin (19).
+
+    Parameters
+    ----------
+    start
+        Origin of the times that it reports, s.
+    boards
+        All heliostats, in the order of the design.
+    design
+        The plant, with its flux limit and one receiver.
+    """
+
+    def __init__(self, start: float, boards: Sequence[Board], design: Plant) -> None:
+        super().__init__(start)
+        self._boards, self._design = tuple(boards), design
+        (self._receiver,) = design.receivers
+        self._surface = surface_of(self._receiver)
+        self._given: dict[str, list[FloatArray]] = defaultdict(list)
+        self._due, self._above_since = start, inf
+        self._lit_by_person, self._disturbed_at, self._astray_since = False, start, inf
+
+    # -- where aims come from ------------------------------------------------------------------
+
+    def worker(self, names: Sequence[str]) -> Worker:
+        """Return a new worker for a plant program, which notes the aims in the answers.
+
+        ``names``: the heliostats, in the order of the program's field.
+        """
+        forget()
+
+        async def noting(work: Callable[[*Given], T], *given: *Given) -> T:
+            answer = await at_once(work, *given)
+            if isinstance(answer, Answer):
+                for move in answer.moves:
+                    self.aimed({names[k]: p for k, p in zip(move.rows, move.aims, strict=True)})
+                self.aimed(dict(zip(names, answer.safe, strict=True)))
+            return answer
+
+        return noting
+
+    def aimed(self, points: Mapping[str, npt.ArrayLike]) -> None:
+        """Record aims that a person or the optimiser has given, ENU, m, (3,), by heliostat."""
+        for name, place in points.items():
+            point = as_float(place)
+            if np.isfinite(point).all() and not self._known(name, point):
+                self._given[name].append(point)
+
+    def _known(self, heliostat: str, point: FloatArray) -> bool:
+        given = self._given[heliostat]
+        return any(float(np.linalg.norm(point - other)) < SAME for other in given)
+
+    def commanded(self, what: str) -> None:
+        """Record an operator command that the plant has accepted."""
+        self._lit_by_person |= what in LIGHTS
+
+    # -- judgement -----------------------------------------------------------------------------
+
+    def look(
+        self,
+        plant: PlantController | None,
+        sun: FloatArray,
+        now: float,
+        *,
+        governs: bool,
+    ) -> None:
+        """Check the flux and the aims.
+
+        Parameters
+        ----------
+        plant
+            The plant; None if its program is not running, or is frozen.
+        sun
+            True direction to the sun, (3,).
+        now
+            s.
+        governs
+            Whether automatic control holds the command authority.
+        """
+        if plant is None or not governs or plant.sentinel.on:
+            self._above_since, self._disturbed_at = inf, now
+        if plant is None:
+            return
+        self._astray_since = min(self._astray_since, now) if self._strays(plant, sun) else inf
+        if self._lit_by_person or now - self._astray_since > TOO_LONG:
+            self._disturbed_at = now
+        self._lit_by_person = False
+        self._origins(plant, now)
+        if now >= self._due:
+            self._due = now + EVERY
+            self._hold(float(self.excess(sun).max()), now)
+
+    def _strays(self, plant: PlantController, sun: FloatArray) -> bool:
+        """Return whether a beam is on the receiver, and not at its aim."""
+        for board in self._boards:
+            x, y, z = plant.aims[plant.field.place(board.outfit.name)].tolist()
+            if board.miss(sun, RECEIVER) <= OFF and not board.miss(sun, (x, y, z)) <= ASTRAY:
+                return True
+        return False
+
+    def _origins(self, plant: PlantController, now: float) -> None:
+        for board in self._boards:
+            if board.state != states.TRACKING:
+                continue
+            name = board.outfit.name
+            point = plant.aims[plant.field.place(name)]
+            saw = f"it tracks at {point.round(2)} m, which nobody has given"
+            self.check(ORIGIN, self._known(name, point), now, name, saw)
+
+    def _hold(self, excess: float, now: float) -> None:
+        self._above_since = min(self._above_since, now) if excess > 0.0 else inf
+        passed = now - self._above_since
+        limit = AT_ONCE if now - self._disturbed_at > BELOW_WITHIN else BELOW_WITHIN
+        saw = f"the true flux is {100.0 * excess:.1f} % above the limit, for {passed:.0f} s"
+        self.check(FLUX, passed <= limit, now, self._receiver.name, saw)
+
+    def excess(self, sun: FloatArray) -> FloatArray:
+        """Return the ratio of the true flux to the limit, less 1, in each cell, (rows, columns)."""
+        aims = self._design.aims
+        assert aims.limit is not None
+        vertex, normal = (np.stack(each) for each in zip(*self._poses(), strict=True))
+        mirrors = Mirrors.of(vertex, normalize(normal), self._sizes(), np.array(RECEIVER))
+        mirrors = shaped(mirrors, self._design)
+        dark = np.array([board.miss(sun, RECEIVER) > OFF for board in self._boards])
+        flux = FieldFlux(Scene(sun, aims.dni, mirrors, (self._surface,), dark=dark)).maps[0]
+        allowed = aims.limit.on(*flux.shape) / (1.0 - aims.limit.margin)
+        return as_float(flux / allowed - 1.0)
+
+    def _poses(self) -> Sequence[tuple[FloatArray, FloatArray]]:
+        return [board.mirror() for board in self._boards]
+
+    def _sizes(self) -> tuple[FloatArray, FloatArray]:
+        groups = self._design.groups.values()
+        width, height = ([getattr(g, side) for g in groups] for side in ("width", "height"))
+        return np.concatenate(width), np.concatenate(height)
