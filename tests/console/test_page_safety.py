@@ -244,17 +244,21 @@ def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
     field: LiveConsole, enter: Callable[..., Any]
 ) -> None:
     page, viewer = enter("operator"), enter("viewer")
-    name = field.live.names[3]
-    # From stow it would be parked at once.
-    until(page, "!['STOWED', 'stale'].includes(heliotrope.store.stateName(3))")
-    page.evaluate("heliotrope.store.select([3], 3)")
+    # One that is not in stow: from there it would be parked at once.
+    row = page.evaluate(
+        "heliotrope.store.field.names.findIndex("
+        "(_, row) => !['STOWED', 'stale'].includes(heliotrope.store.stateName(row)))"
+    )
+    assert row >= 0
+    name = field.live.names[row]
+    page.evaluate("row => heliotrope.store.select([row], row)", row)
     page.click(".hx-orders >> text=Out of service")
     page.fill("dialog [name=reason]", "washing")
     page.fill("dialog [name=hours]", "2")
     page.click("dialog >> text='Out of service'")
     for each in (page, viewer):
         each.wait_for_selector(".hx-legend .hx-out:has-text('out of service 1')")
-        assert each.evaluate("[...heliotrope.store.out].indexOf(1)") == 3
+        assert each.evaluate("[...heliotrope.store.out].indexOf(1)") == row
     said(page, f"OUT_OF_SERVICE: 1 acknowledged ({name}: on its way to stow: ")
     said(page, f"OUT_OF_SERVICE: 1 done ({name}: parked in stow and locked out")
     assert field.live.operations.viewer.heliostat(name).state == "STOWED"
@@ -277,9 +281,9 @@ def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
     said(page, f"{name}: out of service: washing")
     assert field.call(lambda: field.live.operations.viewer.heliostat(name).state) == "STOWED"
     page.click(".hx-tabs >> text=Schedule")
-    row = page.locator(f".hx-schedule tr:has-text('{name}'):has-text('washing')")
-    assert "STOWED" in row.inner_text()
-    row.locator("text=Return lock").click()
+    shown_row = page.locator(f".hx-schedule tr:has-text('{name}'):has-text('washing')")
+    assert "STOWED" in shown_row.inner_text()
+    shown_row.locator("text=Return lock").click()
     page.click("dialog >> text='Return lock'")
     until(page, "heliotrope.store.out.every((one) => !one)")
     until(page, "!document.querySelector('.hx-legend .hx-out')")
