@@ -20,12 +20,17 @@ from heliotrope.calibration.fit import _fit_kernels, estimator
 from heliotrope.calibration.learn import _drift_kernels, _regime_kernels
 from heliotrope.calibration.learn.learning import learn
 from heliotrope.calibration.median import median
+from heliotrope.field.layouts import malan_plant
+from heliotrope.geometry import normalize
 from heliotrope.jit import COMPILATION, Compilation, as_input, is_compiled
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.kernels import track as track_kernels
 from heliotrope.mechanism.kernels import warm as kernels_of_warm
 from heliotrope.mechanism.kernels.block import track_block
 from heliotrope.mechanism.kernels.chain import jacobian_block, pose_block
+from heliotrope.optics import _look_kernels
+from heliotrope.optics.plant_flux import FieldOptics
+from heliotrope.plant.operations.predicted_flux import predicted
 
 SUN, AIM = (0.0, -0.6, 0.8), (0.0, 0.0, 30.0)
 
@@ -209,6 +214,15 @@ def test_warming_leaves_nothing_for_learning_to_compile() -> None:
     counts = ht.track(mechanism[rows], suns, AIM).best_counts
     seen = ht.sightings(rows, counts, suns, AIM, time=1.7e9 + 86400.0 * np.arange(16))
     learn(mechanism, seen, ("tilt_north", "azimuth_bias"))
+    assert [set(kernel.signatures) for kernel in kernels] == before
+
+
+def test_warming_leaves_nothing_for_the_live_flux_to_compile() -> None:
+    kernels = (_look_kernels.look, _look_kernels.spread, _look_kernels._take)
+    warm.lighting()
+    before = [set(kernel.signatures) for kernel in kernels]
+    light, sun = FieldOptics(), normalize((0.0, 0.6, 0.8))
+    predicted(light.scene(malan_plant(8), sun, None, ()), light)
     assert [set(kernel.signatures) for kernel in kernels] == before
 
 

@@ -152,13 +152,14 @@ def hiding() -> None:
 
 
 def lighting() -> None:
-    """Cast the light of three heliostats on a receiver."""
+    """Cast the light of three heliostats on a receiver, with its uncertainty."""
     from heliotrope.field.layouts import malan_plant
     from heliotrope.geometry import normalize
     from heliotrope.optics.plant_flux import FieldOptics
 
     light = FieldOptics()
-    light.engine(light.scene(malan_plant(3), normalize((0.0, 0.6, 0.8)), None, ()))
+    scene = light.scene(malan_plant(3), normalize((0.0, 0.6, 0.8)), None, ())
+    light.engine(scene).power_slope()
 
 
 def cutting() -> None:

@@ -525,7 +525,8 @@ def _spread(
 
 def _no_errors(count: int, cells: tuple[int, ...]) -> tuple[tuple[FloatArray, ...], IntArray]:
     """Return errors of 0 for a number of mirrors and for all cells, and blocks of mirrors."""
-    none = (np.zeros((count, 2, 2)), np.zeros((count, 0, 2)), np.zeros(cells))
+    # Read-only as those of `FieldFlux.spread`, so that the kernels are compiled once.
+    none = (np.zeros((count, 2, 2)), as_input(np.zeros((count, 0, 2))), as_input(np.zeros(cells)))
     return none, np.arange(count) * _BLOCKS // count
 
 
