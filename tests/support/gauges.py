@@ -2,10 +2,11 @@
 
 Each 50 ms a line is added to the file: the time, the longest wait of the plant's loop since the
 line before, the longest time since a cluster's last lease, and the time since which every one of
-the ``COUNT`` simulated local controllers has heard DEFOCUS; POSIX s and s. Where ``FILE.withdraw``
-appears, the emergency is withdrawn, past all interfaces, and the file removed. The simulated field
-is a program of its own, with a gauge that writes ``FILE.heard``. Its port for clusters is its own:
-another is opened in the plant's loop for the attacks, and its number written to ``FILE.port``.
+the ``COUNT`` simulated local controllers has heard DEFOCUS or STOW; POSIX s and s. Where
+``FILE.withdraw`` appears, the emergency is withdrawn, past all interfaces, and the file removed.
+The simulated field is a program of its own, with a gauge that writes ``FILE.heard``. Its port for
+clusters is its own: another is opened in the plant's loop for the attacks, and its number written
+to ``FILE.port``.
 """
 
 import asyncio
@@ -80,7 +81,7 @@ class Gauges:
                 out.write(f"{time.time()} {lag} {gap} {self._heard()}\n")
 
     def _heard(self) -> float:
-        """Return the time since which all local controllers have heard DEFOCUS, POSIX s."""
+        """Return the time since which all have heard DEFOCUS or STOW, POSIX s."""
         try:
             return float(_heard_file(self._file).read_text("ascii"))
         except (OSError, ValueError):
@@ -140,11 +141,12 @@ def attach(gauges: Gauges) -> None:
 
 
 def attach_to_field(file: Path, count: int) -> None:
-    """Note in the simulated field's program when its local controllers hear DEFOCUS."""
+    """Note in the simulated field's program when its controllers hear DEFOCUS or STOW."""
     tell, heard = FieldBus._tell, np.zeros(count)
 
     def told(self: FieldBus, name: str, rows: range) -> None:
-        if name == "DEFOCUS":
+        # A cluster sends STOW in place of a DEFOCUS that it has not sent when STOW arrives.
+        if name in ("DEFOCUS", "STOW"):
             heard[rows.start : rows.stop] = time.time()
             _heard_file(file).write_text(str(heard.min()), encoding="ascii")
         tell(self, name, rows)
