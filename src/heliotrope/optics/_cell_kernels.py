@@ -99,7 +99,7 @@ def _on_cells(cells, hidden, row, t, blur, count, sums, total, aperture, steep, 
             if pu * pu + pv * pv > 2.0 * DEEP * (image[2] + image[4] + widest):
                 continue
             own = (_form(cell, axes, 0, 0), _form(cell, axes, 0, 1), _form(cell, axes, 1, 1))
-            b, here, slope_u, slope_v = image[3] + own[1] + square * blur[1], 0.0, 0.0, 0.0
+            b, density, slope_u, slope_v = image[3] + own[1] + square * blur[1], 0.0, 0.0, 0.0
             for g in range(len(weights)):
                 a = image[2] + own[0] + square * (blur[0] + variances[g])
                 c = image[4] + own[2] + square * (blur[2] + variances[g])
@@ -107,15 +107,15 @@ def _on_cells(cells, hidden, row, t, blur, count, sums, total, aperture, steep, 
                 form = (pu * pu * c - 2.0 * pu * pv * b + pv * pv * a) * inverse
                 if form < 2.0 * DEEP:
                     part = weights[g] * math.exp(-0.5 * form) * math.sqrt(inverse)
-                    here += part
+                    density += part
                     if steep:
                         slope_u += part * depth * (c * pu - b * pv) * inverse
                         slope_v += part * depth * (a * pv - b * pu) * inverse
             passed = scale * images[1, m, 0]
-            if len(aperture) and here != 0.0:
+            if len(aperture) and density != 0.0:
                 depths = (_before(gate, x, y, z), depth)
                 passed *= _passes(images, m, gate, t, depths, (pu, pv), image, own, wide)
-            out[0, k] += passed * here
+            out[0, k] += passed * density
             out[1, k] += passed * slope_u
             out[2, k] += passed * slope_v
 
@@ -132,7 +132,7 @@ def cast_cells(first, last, rows, mirrors, sun, light, slopes, pointing, sums, p
     `cast`.
     """
     total, room = np.sum(sums[0] * sums[1]), _room(first, last, rows, parts)
-    found = np.empty((3, len(cells)))
+    densities = np.empty((3, len(cells)))
     for i in rows[first:last]:
         out[i, 0] = out[i, 1] = 0.0
         if light[i] <= 0.0:
@@ -146,12 +146,12 @@ def cast_cells(first, last, rows, mirrors, sun, light, slopes, pointing, sums, p
             continue
         _on_cells(
             cells, hidden[group[i]], mirrors[i], t, blur, count, sums, total, aperture, False, room,
-            found,
+            densities,
         )  # fmt: skip
         caught = 0.0
         for k in range(len(cells)):
-            flux[k] += sign * light[i] * found[0, k]
-            caught += light[i] * found[0, k] * cells[k, 6]
+            flux[k] += sign * light[i] * densities[0, k]
+            caught += light[i] * densities[0, k] * cells[k, 6]
         out[i, 1] = caught
 
 
@@ -165,7 +165,7 @@ def spread_cells(first, last, rows, mirrors, sun, light, slopes, pointing, sums,
     `_look_kernels.spread`.
     """
     total, room = np.sum(sums[0] * sums[1]), _room(first, last, rows, parts)
-    found = np.empty((3, len(cells)))
+    densities = np.empty((3, len(cells)))
     for i in rows[first:last]:
         if light[i] <= 0.0:
             continue
@@ -177,13 +177,13 @@ def spread_cells(first, last, rows, mirrors, sun, light, slopes, pointing, sums,
             continue
         _on_cells(
             cells, hidden[group[i]], mirrors[i], t, blur, count, sums, total, aperture, True, room,
-            found,
+            densities,
         )  # fmt: skip
         for k in range(len(cells)):
-            u, v = light[i] * found[1, k], light[i] * found[2, k]
-            one, two = scatter[i, 0] * u + scatter[i, 1] * v, scatter[i, 2] * v
-            own[k] += one * one + two * two
-            value[i] += (one * one + two * two) * worth[k]
+            u, v = light[i] * densities[1, k], light[i] * densities[2, k]
+            du, dv = scatter[i, 0] * u + scatter[i, 1] * v, scatter[i, 2] * v
+            own[k] += du * du + dv * dv
+            value[i] += (du * du + dv * dv) * worth[k]
             slope[i, 0] += u * cells[k, 6]
             slope[i, 1] += v * cells[k, 6]
             for m in range(modes.shape[1]):
@@ -236,10 +236,10 @@ def _gate(aperture, row, ray, axes, gate):
         at = 4 + 4 * e
         gate[at] = gate[at + 1] = gate[at + 2] = 0.0
         for k in range(3):
-            way = aperture[3 + 3 * e + k] - lean * gate[k]
-            gate[at] += way * (row[k] - aperture[k])
-            gate[at + 1] += way * axes[0, k]
-            gate[at + 2] += way * axes[1, k]
+            side = aperture[3 + 3 * e + k] - lean * gate[k]
+            gate[at] += side * (row[k] - aperture[k])
+            gate[at + 1] += side * axes[0, k]
+            gate[at + 2] += side * axes[1, k]
         gate[at + 3] = aperture[9 + e]
 
 
@@ -293,26 +293,26 @@ def _passes(images, m, gate, t, depths, place, f, own, blur):
 
 
 @njit(**OPTIONS)
-def hide(first, last, ways, cells, corners, hidden):
-    """Mark the cells that other triangles (C, 3, 3) hide from light along ``ways[first:last]``."""
+def hide(first, last, directions, cells, corners, hidden):
+    """Mark the cells that other triangles (C, 3, 3) hide from light along some directions."""
     for d in range(first, last):
-        way = ways[d]
+        direction = directions[d]
         for k in range(len(cells)):
             hidden[d, k] = False
-            if _of(way, cells[k], 3) >= 0.0:
+            if _of(direction, cells[k], 3) >= 0.0:
                 hidden[d, k] = True
                 continue
             for j in range(len(corners)):
-                if j != k and _meets(cells[k], way, corners[j]):
+                if j != k and _meets(cells[k], direction, corners[j]):
                     hidden[d, k] = True
                     break
 
 
 @njit(**INNER)
-def _meets(cell, way, triangle):
+def _meets(cell, direction, triangle):
     """Whether the ray from a cell, against the light, meets a triangle (Möller and Trumbore)."""
     a, b = triangle[1] - triangle[0], triangle[2] - triangle[0]
-    x, y, z = -way[0], -way[1], -way[2]
+    x, y, z = -direction[0], -direction[1], -direction[2]
     px, py, pz = y * b[2] - z * b[1], z * b[0] - x * b[2], x * b[1] - y * b[0]
     det = a[0] * px + a[1] * py + a[2] * pz
     if abs(det) < 1e-14:

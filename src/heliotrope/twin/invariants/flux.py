@@ -60,7 +60,7 @@ class FluxObserver(Judge):
         self._boards, self._design = tuple(boards), design
         (self._receiver,) = design.receivers
         self._surface = surface_of(self._receiver)
-        self._given: dict[str, list[FloatArray]] = defaultdict(list)
+        self._sources: dict[str, list[FloatArray]] = defaultdict(list)
         self._due, self._above_since = start, inf
         self._lit_by_person, self._disturbed_at, self._astray_since = False, start, inf
 
@@ -88,11 +88,11 @@ class FluxObserver(Judge):
         for name, place in points.items():
             point = as_float(place)
             if np.isfinite(point).all() and not self._known(name, point):
-                self._given[name].append(point)
+                self._sources[name].append(point)
 
     def _known(self, heliostat: str, point: FloatArray) -> bool:
-        given = self._given[heliostat]
-        return any(float(np.linalg.norm(point - other)) < SAME for other in given)
+        sources = self._sources[heliostat]
+        return any(float(np.linalg.norm(point - other)) < SAME for other in sources)
 
     def commanded(self, what: str) -> None:
         """Record an operator command that the plant has accepted."""
@@ -162,7 +162,7 @@ class FluxObserver(Judge):
         """Return the ratio of the true flux to the limit, less 1, in each cell, (rows, columns)."""
         aims = self._design.aims
         assert aims.limit is not None
-        vertex, normal = (np.stack(each) for each in zip(*self._poses(), strict=True))
+        vertex, normal = (np.stack(vectors) for vectors in zip(*self._poses(), strict=True))
         mirrors = Mirrors.of(vertex, normalize(normal), self._sizes(), np.array(RECEIVER))
         mirrors = shaped(mirrors, self._design)
         dark = np.array([board.miss(sun, RECEIVER) > OFF for board in self._boards])
