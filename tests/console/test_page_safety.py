@@ -153,9 +153,16 @@ def test_an_emergency_is_withdrawn_after_one_question_and_its_text_ends(
     field.calm()
     page.wait_for_selector('.hx-alert.on:has-text("wait until an operator presses Resume")')
     page.wait_for_selector(".hx-plant p:has-text('ordered by')", state="detached")
+    # Automatic control goes on when nobody else has command, and the page says so.
+    page.click(".hx-authority >> text=Take command")
+    page.wait_for_selector(".hx-authority >> text=You have command")
     page.click(".hx-alert button >> text=Resume")
+    page.wait_for_selector("dialog h2:has-text('as soon as operator releases command')")
     page.click("dialog >> text='Resume'")
     until(page, "!document.querySelector('.hx-alert.on')")
+    said(page, "Automatic control goes on as soon as operator releases command.")
+    page.click(".hx-authority >> text=Release")
+    page.wait_for_selector(".hx-authority >> text=automatic control has command")
 
 
 def test_the_page_says_what_a_proof_has_measured_and_what_it_believes(

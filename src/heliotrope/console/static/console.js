@@ -6,7 +6,7 @@ import { shift } from "./shift.js";
 import { VIEWS } from "./palette.js";
 import * as panels from "./panels.js";
 import * as people from "./people.js";
-import { act, bar, say, whoCommands } from "./orders.js";
+import { act, AUTOMATIC, bar, say, whoCommands } from "./orders.js";
 import { ask, count, h } from "./dom.js";
 import { alertText, headOf } from "./showing.js";
 import { t } from "./words.js";
@@ -52,7 +52,10 @@ function alert(box) {
     } catch (error) { say(error.message, true); }
   } }, t("Withdraw"));
   const resume = h("button", { className: "hx-button", onclick: async () => {
-    if (await ask(t("Resume automatic control? It raises the heliostats that it had."), [], t("Resume"))) await act(() => api("POST", "automatic/resume"), t("Resume"));
+    const { holder } = store.head, held = holder && holder !== AUTOMATIC;
+    const question = held ? t("Resume automatic control? It raises the heliostats that it had as soon as {who} releases command.", { who: holder }) : t("Resume automatic control? It raises the heliostats that it had.");
+    if (!await ask(question, [], t("Resume"))) return;
+    await act(async () => { await api("POST", "automatic/resume"); if (held) say(t("Automatic control goes on as soon as {who} releases command.", { who: holder })); }, t("Resume"), !held);
   } }, t("Resume"));
   alertText(box);
   box.append(viewer ? "" : back, viewer ? "" : resume);

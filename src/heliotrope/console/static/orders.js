@@ -3,7 +3,7 @@ import { api, me, store } from "./live.js";
 import { ask, count, h } from "./dom.js";
 import { t, word } from "./words.js";
 
-const AUTOMATIC = word("automatic control"); // as the plant names it
+export const AUTOMATIC = word("automatic control"); // as the plant names it
 
 export const say = (text, bad) => store.emit("said", { text, bad });
 
