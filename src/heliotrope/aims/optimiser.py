@@ -174,17 +174,17 @@ def _settled(
     idle: float,
 ) -> Choice:
     """Return a choice that respects the cap."""
-    mine, flux = choice.copy(), field.flux(choice)
+    mine, over = choice.copy(), field.flux(choice) - cap
     # The mirrors that yield least for their price leave first.
     rows = np.arange(len(mine))
     paid = np.where(mine >= 0, field.power[rows, np.maximum(mine, 0)], 0.0)
     order = np.argsort(paid, kind="stable")
     for k, fine in enumerate(FINES):
         kernels.settle(
-            order, field.table, field.shifts, field.power, idle, cap, mine, flux,
+            order, field.table, field.shifts, field.power, idle, mine, over,
             fine * field.images.area, k == 0,
         )  # fmt: skip
-        if not (flux > cap * (1.0 + 1e-9)).any():
+        if not (over > 1e-9 * cap).any():
             break
     flux = field.flux(mine)
     power = field.power[rows, np.maximum(mine, 0)][mine >= 0].sum()
