@@ -102,36 +102,38 @@ def flux_of(mirrors, choice, images, shifts, flux):
 
 
 @njit(**_INNER_SUMS)
-def _reprice(i, a, images, shifts, flux, cap, toll, steep, price, spans):
-    """Update the prices of a candidate's cells."""
+def _add_priced(i, a, sign, images, shifts, flux, base, steep, price, spans):
+    """Add a candidate's image to the flux, and update the prices of its cells."""
+    values, weight = images[0], images[4]
     wide, number = flux.shape
-    c, columns, low, high, _, _ = _rectangle(i, a, images, shifts, number)
+    c, columns, low, high, at, rows = _rectangle(i, a, images, shifts, number)
+    scale, count = sign * weight[i], high - low
     for _ in range(columns):
-        top, bottom = spans[c, 1], spans[c, 0]
-        for r in range(low, high):
-            value = toll[c, r] + steep[c, r] * (flux[c, r] - cap[c, r])
-            value = max(value, 0.0)
-            price[c, r] = value
-        for r in range(low, min(bottom, high)):
+        light, line = values[at : at + count], flux[c, low:high]
+        slope, toll, new = steep[c, low:high], base[c, low:high], price[c, low:high]
+        for r in range(count):
+            line[r] += scale * light[r]
+            new[r] = max(toll[r] + slope[r] * line[r], 0.0)
+        for r in range(low, min(spans[c, 0], high)):
             if price[c, r] > 0.0:
                 spans[c, 0] = r
                 break
-        for r in range(high - 1, max(top, low) - 1, -1):
+        for r in range(high - 1, max(spans[c, 1], low) - 1, -1):
             if price[c, r] > 0.0:
                 spans[c, 1] = r + 1
                 break
+        at += rows
         c += 1
         if c == wide:
             c = 0
 
 
 @njit(**_SUMS)
-def sweep(order, images, shifts, power, idle, cap, toll, steep, choice, flux, price, spans):
+def sweep(order, images, shifts, power, idle, base, steep, choice, flux, price, spans):
     """Let each mirror in turn take its most valuable candidate; return the number of changes.
 
-    The price of flux in a cell is ``max(0, toll + steep (flux − cap))``, W per W/m², as in an
-    augmented Lagrangian. ``power`` (H, A) in W; ``idle``: the value of sending no light, W.
-    ``choice`` (H,),
+    The price of flux in a cell is ``max(0, base + steep flux)``, W per W/m², as in an augmented
+    Lagrangian. ``power`` (H, A) in W; ``idle``: the value of sending no light, W. ``choice`` (H,),
     ``flux``, ``price`` and ``spans`` are kept up to date.
     """
     worth = np.empty(power.shape[1])
@@ -139,8 +141,7 @@ def sweep(order, images, shifts, power, idle, cap, toll, steep, choice, flux, pr
     for i in order:
         before = choice[i]
         if before >= 0:
-            _add(i, before, -1.0, images, shifts, flux)
-            _reprice(i, before, images, shifts, flux, cap, toll, steep, price, spans)
+            _add_priced(i, before, -1.0, images, shifts, flux, base, steep, price, spans)
         _worth(i, images, shifts, price, spans, worth)
         best, gain = -1, idle
         for a in range(len(worth)):
@@ -149,8 +150,7 @@ def sweep(order, images, shifts, power, idle, cap, toll, steep, choice, flux, pr
                 best, gain = a, value
         choice[i] = best
         if best >= 0:
-            _add(i, best, 1.0, images, shifts, flux)
-            _reprice(i, best, images, shifts, flux, cap, toll, steep, price, spans)
+            _add_priced(i, best, 1.0, images, shifts, flux, base, steep, price, spans)
         changed += best != before
     return changed
 

@@ -157,9 +157,10 @@ def _sweep(
     """Let mirrors choose in the given order, and return the new prices."""
     flux = field.flux(choice, order)
     steep = STEEP * field.images.area / cap
-    now = np.maximum(prices + steep * (flux - cap), 0.0)
+    base = prices - steep * cap
+    now = np.maximum(base + steep * flux, 0.0)
     kernels.sweep(
-        order, field.table, field.shifts, field.power, idle, cap, prices, steep, choice, flux,
+        order, field.table, field.shifts, field.power, idle, base, steep, choice, flux,
         now.astype(np.float32), spans_of(now),
     )  # fmt: skip
     return as_float(np.maximum(prices + steep * (flux - cap), 0.0))
