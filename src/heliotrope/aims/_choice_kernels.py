@@ -102,36 +102,38 @@ def flux_of(mirrors, choice, images, shifts, flux):
 
 
 @njit(**_INNER_SUMS)
-def _reprice(i, a, images, shifts, flux, cap, toll, steep, price, spans):
-    """Update the prices of a candidate's cells."""
+def _add_priced(i, a, sign, images, shifts, flux, base, steep, price, spans):
+    """Add a candidate's image to the flux, and update the prices of its cells."""
+    values, weight = images[0], images[4]
     wide, number = flux.shape
-    c, columns, low, high, _, _ = _rectangle(i, a, images, shifts, number)
+    c, columns, low, high, at, rows = _rectangle(i, a, images, shifts, number)
+    scale, count = sign * weight[i], high - low
     for _ in range(columns):
-        top, bottom = spans[c, 1], spans[c, 0]
-        for r in range(low, high):
-            value = toll[c, r] + steep[c, r] * (flux[c, r] - cap[c, r])
-            value = max(value, 0.0)
-            price[c, r] = value
-        for r in range(low, min(bottom, high)):
+        light, line = values[at : at + count], flux[c, low:high]
+        slope, toll, new = steep[c, low:high], base[c, low:high], price[c, low:high]
+        for r in range(count):
+            line[r] += scale * light[r]
+            new[r] = max(toll[r] + slope[r] * line[r], 0.0)
+        for r in range(low, min(spans[c, 0], high)):
             if price[c, r] > 0.0:
                 spans[c, 0] = r
                 break
-        for r in range(high - 1, max(top, low) - 1, -1):
+        for r in range(high - 1, max(spans[c, 1], low) - 1, -1):
             if price[c, r] > 0.0:
                 spans[c, 1] = r + 1
                 break
+        at += rows
         c += 1
         if c == wide:
             c = 0
 
 
 @njit(**_SUMS)
-def sweep(order, images, shifts, power, idle, cap, toll, steep, choice, flux, price, spans):
+def sweep(order, images, shifts, power, idle, base, steep, choice, flux, price, spans):
     """Let each mirror in turn take its most valuable candidate; return the number of changes.
 
-    The price of flux in a cell is ``max(0, toll + steep (flux − cap))``, W per W/m², as in an
-    augmented Lagrangian. ``power`` (H, A) in W; ``idle``: the value of sending no light, W.
-    ``choice`` (H,),
+    The price of flux in a cell is ``max(0, base + steep flux)``, W per W/m², as in an augmented
+    Lagrangian. ``power`` (H, A) in W; ``idle``: the value of sending no light, W. ``choice`` (H,),
     ``flux``, ``price`` and ``spans`` are kept up to date.
     """
     worth = np.empty(power.shape[1])
@@ -139,8 +141,7 @@ def sweep(order, images, shifts, power, idle, cap, toll, steep, choice, flux, pr
     for i in order:
         before = choice[i]
         if before >= 0:
-            _add(i, before, -1.0, images, shifts, flux)
-            _reprice(i, before, images, shifts, flux, cap, toll, steep, price, spans)
+            _add_priced(i, before, -1.0, images, shifts, flux, base, steep, price, spans)
         _worth(i, images, shifts, price, spans, worth)
         best, gain = -1, idle
         for a in range(len(worth)):
@@ -149,55 +150,54 @@ def sweep(order, images, shifts, power, idle, cap, toll, steep, choice, flux, pr
                 best, gain = a, value
         choice[i] = best
         if best >= 0:
-            _add(i, best, 1.0, images, shifts, flux)
-            _reprice(i, best, images, shifts, flux, cap, toll, steep, price, spans)
+            _add_priced(i, best, 1.0, images, shifts, flux, base, steep, price, spans)
         changed += best != before
     return changed
 
 
 @njit(**_INNER_SUMS)
-def _excess(i, a, images, shifts, flux, cap, most):
-    """Return the excess over the cap with a candidate, summed over its cells.
+def _excess(i, a, images, shifts, over, most):
+    """Return the excess over the cap that a candidate adds, summed over its cells.
 
-    The sum stops at ``most``.
+    The sum stops at ``most``. It begins in the middle of the image, where the light is.
     """
     values, weight = images[0], images[4]
-    wide, number = flux.shape
-    c, columns, low, high, at, rows = _rectangle(i, a, images, shifts, number)
+    wide, number = over.shape
+    first, columns, low, high, at, rows = _rectangle(i, a, images, shifts, number)
+    scale, count = weight[i], high - low
     total = 0.0
-    for _ in range(columns):
-        for r in range(low, high):
-            total += max(0.0, flux[c, r] + weight[i] * values[at + r - low] - cap[c, r])
+    for k in range(columns):
+        column = (columns // 2 + k) % columns
+        line = over[(first + column) % wide, low:high]
+        begin = at + column * rows
+        light = values[begin : begin + count]
+        for r in range(count):
+            total += max(0.0, line[r] + scale * light[r]) - max(0.0, line[r])
         if total > most:
             return total
-        at += rows
-        c += 1
-        if c == wide:
-            c = 0
     return total
 
 
 @njit(**_INNER_SUMS)
-def _above(i, a, images, shifts, flux, cap):
-    """Return the present excess in a candidate's cells, without the candidate itself."""
-    wide, number = flux.shape
-    c, columns, low, high, _, _ = _rectangle(i, a, images, shifts, number)
-    total = 0.0
-    for _ in range(columns):
-        for r in range(low, high):
-            total += max(0.0, flux[c, r] - cap[c, r])
-        c += 1
-        if c == wide:
-            c = 0
-    return total
+def _free(i, a, images, shifts, over):
+    """Return whether none of a candidate's cells is above the cap."""
+    wide, number = over.shape
+    first, columns, low, high, _, _ = _rectangle(i, a, images, shifts, number)
+    for k in range(columns):
+        column = (columns // 2 + k) % columns
+        line = over[(first + column) % wide, low:high]
+        for r in range(high - low):
+            if line[r] > 0.0:
+                return False
+    return True
 
 
 @njit(**_SUMS)
-def settle(order, images, shifts, power, idle, cap, choice, flux, fine, fill):
+def settle(order, images, shifts, power, idle, choice, over, fine, fill):
     """Let each mirror in turn take the best candidate after penalties; return how many changed.
 
-    ``fine``: penalty on the excess that a candidate adds, W per W/m². ``idle``: the value of
-    sending no light, W. Without
+    ``over``: flux minus the cap, W/m², (columns, rows), kept up to date. ``fine``: penalty on the
+    excess that a candidate adds, W per W/m². ``idle``: the value of sending no light, W. Without
     ``fill`` only mirrors that add to an excess change.
     """
     changed = 0
@@ -209,13 +209,19 @@ def settle(order, images, shifts, power, idle, cap, choice, flux, fine, fill):
             net[a] = power[i, a]
             top = max(top, net[a])
         if before >= 0:
-            free = _above(i, before, images, shifts, flux, cap) <= 0.0
-            if free and (not fill or net[before] >= top):
+            if (not fill or net[before] >= top) and _free(i, before, images, shifts, over):
                 continue
-            _add(i, before, -1.0, images, shifts, flux)
+            _add(i, before, -1.0, images, shifts, over)
         elif not fill:
             continue
         best, gain = -1, idle
+        if before >= 0:
+            # The others are given up as soon as they are worse than this one.
+            more = _excess(i, before, images, shifts, over, np.inf)
+            value = net[before] - fine * more
+            if value > gain:
+                best, gain = before, value
+            net[before] = -1e300
         while True:
             a = 0
             for b in range(1, len(net)):
@@ -224,16 +230,14 @@ def settle(order, images, shifts, power, idle, cap, choice, flux, fine, fill):
             # The remaining candidates have less power, so none of them is better.
             if net[a] <= gain:
                 break
-            present = _above(i, a, images, shifts, flux, cap)
-            most = present + (net[a] - max(gain, -1e15)) / fine
-            more = _excess(i, a, images, shifts, flux, cap, most) - present
-            value = net[a] - fine * max(more, 0.0)
+            most = (net[a] - max(gain, -1e15)) / fine
+            value = net[a] - fine * _excess(i, a, images, shifts, over, most)
             if value > gain:
                 best, gain = a, value
             net[a] = -1e300
         choice[i] = best
         if best >= 0:
-            _add(i, best, 1.0, images, shifts, flux)
+            _add(i, best, 1.0, images, shifts, over)
         changed += best != before
     return changed
 

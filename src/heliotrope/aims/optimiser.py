@@ -157,9 +157,10 @@ def _sweep(
     """Let mirrors choose in the given order, and return the new prices."""
     flux = field.flux(choice, order)
     steep = STEEP * field.images.area / cap
-    now = np.maximum(prices + steep * (flux - cap), 0.0)
+    base = prices - steep * cap
+    now = np.maximum(base + steep * flux, 0.0)
     kernels.sweep(
-        order, field.table, field.shifts, field.power, idle, cap, prices, steep, choice, flux,
+        order, field.table, field.shifts, field.power, idle, base, steep, choice, flux,
         now.astype(np.float32), spans_of(now),
     )  # fmt: skip
     return as_float(np.maximum(prices + steep * (flux - cap), 0.0))
@@ -174,17 +175,17 @@ def _settled(
     idle: float,
 ) -> Choice:
     """Return a choice that respects the cap."""
-    mine, flux = choice.copy(), field.flux(choice)
+    mine, over = choice.copy(), field.flux(choice) - cap
     # The mirrors that yield least for their price leave first.
     rows = np.arange(len(mine))
     paid = np.where(mine >= 0, field.power[rows, np.maximum(mine, 0)], 0.0)
     order = np.argsort(paid, kind="stable")
     for k, fine in enumerate(FINES):
         kernels.settle(
-            order, field.table, field.shifts, field.power, idle, cap, mine, flux,
+            order, field.table, field.shifts, field.power, idle, mine, over,
             fine * field.images.area, k == 0,
         )  # fmt: skip
-        if not (flux > cap * (1.0 + 1e-9)).any():
+        if not (over > 1e-9 * cap).any():
             break
     flux = field.flux(mine)
     power = field.power[rows, np.maximum(mine, 0)][mine >= 0].sum()

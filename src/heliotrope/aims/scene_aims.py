@@ -239,7 +239,9 @@ def _held(
     more = np.zeros_like(limit)
     choice = None if start is None else start.choice
     if start is not None:
-        more = start.quantile - start.choice.flux.T
+        # Relative to the light, which may have changed.
+        light_now = field.flux(start.choice.choice).sum() / max(start.choice.flux.sum(), 1e-300)
+        more = light_now * (start.quantile - start.choice.flux.T)
     best: SceneAims | None = None
     for k in range(ROUNDS):
         cap = np.maximum(aimed_at - more, LEAST * limit)
