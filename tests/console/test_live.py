@@ -24,6 +24,7 @@ from heliotrope.console._secrets import verify_password
 from heliotrope.console.stream import MARK, ROW, changed, message
 from heliotrope.local import AwayError
 from heliotrope.plant.interface import plain
+from heliotrope.plant.orders.authority import Person, Role
 from support.live_console import PASSWORD, LiveConsole
 
 Ask = Callable[..., httpx.Response]
@@ -177,6 +178,20 @@ def test_ctl_says_what_a_proof_has_measured_and_what_it_believes(
     finally:
         ctl("operator", "emergency", "--withdraw")
         console.calm()
+
+
+def test_ctl_says_for_whom_automatic_control_waits(
+    ctl: Callable[..., Any], console: LiveConsole
+) -> None:
+    here, resumed = console.live.operations, "automatic control resumed"
+    console.release()
+    token = console.call(lambda: here.take_authority(Person("vera", Role.OPERATOR)).token)
+    try:
+        held = ctl("operator", "resume")
+    finally:
+        console.call(lambda: here.release_authority(Person("vera", Role.OPERATOR), token))
+    assert held.stdout == f"{resumed}; it goes on as soon as vera releases command\n", held.output
+    assert ctl("operator", "resume").stdout == f"{resumed}\n"
 
 
 @pytest.mark.parametrize(

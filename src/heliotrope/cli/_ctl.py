@@ -1382,7 +1382,12 @@ def resume(context: typer.Context) -> None:
     """Resume automatic control after many heliostats were lost."""
     with _client(context) as client:
         client.ask("POST", "automatic/resume")
-    print("automatic control resumed")
+        holder = client.get("authority")["holder"]
+    waits = holder and holder != "automatic control"
+    print(
+        "automatic control resumed"
+        + (f"; it goes on as soon as {holder} releases command" if waits else "")
+    )
 
 
 def _utc(at: float) -> str:
