@@ -24,16 +24,16 @@ heliostat's maker and the receiver limits by those of the receiver's maker, in t
 ## Rules for every row
 
 - A reading that is missing, not a number, or from the future is ignored. The last good reading is
-  used until it is older than *stale after*; from then on the worst case is assumed. In rows about an
-  age or a silence (*grows*), the time continues to increase without new readings.
+  used until it is older than *stale after*; from then on the worst case is assumed. In rows about
+  an age or a silence (*grows*), the time continues to increase without new readings.
 - A row trips when its value has been at the limit or beyond it for the *delay*. It is released when
   fresh readings have been on the safe side of the release limit for the time given. Between the two
   limits it does not change. If readings stop arriving, nothing is released.
 - A row that *latches* remains tripped until its cause has gone and a person with the given role, or
   a higher one, acknowledges it. An acknowledgement before the cause has gone is refused.
-- If several rows have tripped, the strongest action applies; the list below is in order of strength.
-  DEFOCUS and STOW pre-empt every motion. The release of a row does not move any heliostat: returning
-  to the receiver needs a fresh command under the command authority.
+- If several rows have tripped, the strongest action applies; the list below goes from the weakest
+  to the strongest. DEFOCUS and STOW pre-empt every motion. The release of a row does not move any
+  heliostat: returning to the receiver needs a fresh command under the command authority.
 - The *budget* is the time from the fault to the finished action, including the detection.
 """
 
@@ -49,8 +49,8 @@ reading must show that the flux on the receiver is below 10 % of nominal; otherw
 
 ## Joining the receiver
 
-A token bucket (`JoinLimiter`) limits how many heliostats join the receiver: at most burst + rate · T
-in any span of T seconds.
+A token bucket (`JoinLimiter`) limits how many heliostats join the receiver: at most
+burst + rate · T in any span of T seconds.
 
 ## What the table does not do
 
