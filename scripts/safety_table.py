@@ -10,11 +10,11 @@ PAGE = "docs/explanation/safety.md"
 _INTRO = """\
 # Safety
 
-One table (`heliotrope.safety`) says what trips, what is then done, and when it ends. The plant,
-the clusters and the local controllers each evaluate the rows assigned to them. The evaluation is
-a pure function of readings, state and monotonic time. `python -m scripts.pages` writes this page
-from the table. The handbook says what each alarm means and what
-the operator should do.
+One table (`heliotrope.safety`) contains one row for each safety condition. The row says when the
+condition trips, what is then done, and when it is released. The plant, the clusters and the local
+controllers each evaluate the rows assigned to them. The evaluation is a pure function of readings,
+state and monotonic time. `python -m scripts.pages` writes this page from the table. The handbook
+says what each alarm means and what the operator should do.
 
 The numbers are defaults. Before a plant runs with them, replace the wind limits by those of the
 heliostat's maker and the receiver limits by those of the receiver's maker, in the tables
@@ -23,38 +23,40 @@ heliostat's maker and the receiver limits by those of the receiver's maker, in t
 
 ## Rules for every row
 
-- A reading that is missing, not a number, or from the future does not count. The last good reading
-  counts until it is older than *stale after*; from then on the worst case counts. A row on an age
-  or on silence keeps counting without new readings.
-- A row trips when its value has been at the limit or beyond it for the *delay*. It releases when
+- A reading that is missing, not a number, or from the future is ignored. The last good reading is
+  used until it is older than *stale after*; from then on the worst case is assumed. In rows about
+  an age or a silence (*grows*), the time continues to increase without new readings.
+- A row trips when its value has been at the limit or beyond it for the *delay*. It is released when
   fresh readings have been on the safe side of the release limit for the time given. Between the two
-  limits it stays as it is. If readings stop arriving, nothing is released.
-- A row that *latches* stays until its cause has gone and a person with the given role, or a
-  higher one, acknowledges it. An acknowledgement before that is refused.
-- The strongest action wins, in the order of the list below. DEFOCUS and STOW pre-empt every motion.
-  Releasing a row does not move any heliostat: returning to the receiver needs a fresh command under
-  the command authority.
-- The *budget* runs from the fault to the finished action and includes the detection.
+  limits it does not change. If readings stop arriving, nothing is released.
+- A row that *latches* remains tripped until its cause has gone and a person with the given role, or
+  a higher one, acknowledges it. An acknowledgement before the cause has gone is refused.
+- If several rows have tripped, the strongest action applies; the list below goes from the weakest
+  to the strongest. DEFOCUS and STOW pre-empt every motion. The release of a row does not move any
+  heliostat: returning to the receiver needs a fresh command under the command authority.
+- The *budget* is the time from the fault to the finished action, including the detection.
 """
 
 _AFTER = f"""
 ## The proof of an emergency
 
-An order to DEFOCUS or STOW the field lists every heliostat (`Proof`). Each of them must acknowledge
-within {safety.ORDER_BUDGET:g} s and be done within {safety.DEFOCUS_BUDGET:g} s (DEFOCUS) or
-{safety.STOW_BUDGET:g} s (STOW); a heliostat that is not is named. Reports from other heliostats
-and from before the order prove nothing. A fresh reading must show the flux on the receiver below
-10 % of nominal; otherwise `flux_after_emergency` trips.
+An order to DEFOCUS or STOW the field starts a list of all heliostats (`Proof`). Each heliostat must
+acknowledge the order within {safety.ORDER_BUDGET:g} s and have carried it out within
+{safety.DEFOCUS_BUDGET:g} s (DEFOCUS) or {safety.STOW_BUDGET:g} s (STOW); a heliostat that fails to
+do so is named. Reports from other heliostats, or from before the order, prove nothing. A fresh
+reading must show that the flux on the receiver is below 10 % of nominal; otherwise
+`flux_after_emergency` trips.
 
 ## Joining the receiver
 
-A token bucket (`JoinLimiter`) bounds how many heliostats join: in any span of T seconds at most
-burst + rate · T.
+A token bucket (`JoinLimiter`) limits how many heliostats join the receiver: at most
+burst + rate · T in any span of T seconds.
 
 ## What the table does not do
 
-It is software on ordinary computers and has no safety integrity level. The protection of the
-receiver and the emergency line must not depend on it. The limits have not been tried on a plant.
+The table is evaluated by software on ordinary computers, which has no safety integrity level. The
+receiver's own protection and the emergency line must not depend on it. The limits have not been
+tried on a real plant.
 """
 
 

@@ -9,10 +9,10 @@ SAFE, COMMAND, INTERNAL = range(3)
 #: Event: kind, meaning.
 EVENTS = {
     "DEFOCUS": (SAFE, "beams off the receiver, now"),
-    "STOW": (SAFE, "go to stow; where the stow position or the step counts are unknown, turn away"),
-    "LOCK": (COMMAND, "stop and hold position; a motion that takes the beam off is finished first"),
+    "STOW": (SAFE, "go to stow; turn away if the stow position or the step counts are unknown"),
+    "LOCK": (COMMAND, "stop and hold position; complete a motion that takes the beam off first"),
     "APPROACH": (COMMAND, "leave stow for standby"),
-    "IDLE": (COMMAND, "go to standby; where none was reached yet, hold (refused: DEFOCUSED)"),
+    "IDLE": (COMMAND, "go to standby; hold if it was never reached (refused: DEFOCUSED)"),
     "TRACK": (COMMAND, "track the sun onto the aim"),
     "REFOCUS": (COMMAND, "return from defocus to the aim"),
     "SEARCH": (COMMAND, "move the beam in a spiral about its aim"),
@@ -22,8 +22,8 @@ EVENTS = {
     "UNLOCK": (COMMAND, "release a lock, away from stow"),
     "UNLOCK_STOWED": (COMMAND, "release a lock, at stow"),
     "UNLOCK_FAULT": (COMMAND, "release a lock while a fault is latched"),
-    "CLEAR_FAULT": (COMMAND, "when the cause is gone, away from stow"),
-    "CLEAR_FAULT_STOWED": (COMMAND, "when the cause is gone, at stow"),
+    "CLEAR_FAULT": (COMMAND, "clear a fault whose cause has gone, away from stow"),
+    "CLEAR_FAULT_STOWED": (COMMAND, "clear a fault whose cause has gone, at stow"),
     "CONFIGURED": (INTERNAL, "the last missing setting has arrived"),
     "BOOT_STOWED": (INTERNAL, "started with all settings, at stow"),
     "BOOT_AWAY": (INTERNAL, "started with all settings, away from stow"),
@@ -32,7 +32,7 @@ EVENTS = {
     "ARRIVED": (INTERNAL, "the motion is complete"),
     "SEARCHED": (INTERNAL, "the spiral is complete"),
     "LAPSED": (INTERNAL, "the sun vector or, for a mirror at rest, the last message is too old"),
-    "SILENT": (INTERNAL, "no reason to stay during the stow delay"),
+    "SILENT": (INTERNAL, "throughout the stow delay, nothing arrived that keeps it from stow"),
     "UNREACHABLE": (INTERNAL, "no pose sends the beam to the aim"),
     "FAULTED": (INTERNAL, "a fault has been detected"),
 }
@@ -40,15 +40,15 @@ EVENTS = {
 #: Motion: meaning.
 MOTIONS = {
     "hold": "slow down and stop",
-    "lock": "finish a turn away or the motion to stow; otherwise slow down and stop",
+    "lock": "complete a turn away or a motion to stow; otherwise slow down and stop",
     "defocus": "turn away by the defocus angles, without needing the sun",
     "stow": "back along the approach path, then to stow, azimuth last",
-    "stow_directly": "to stow at once: elevation first, azimuth last",
+    "stow_directly": "straight to stow: elevation first, azimuth last",
     "approach": "azimuth first, elevation last, along the ground to the tower and up",
-    "standby": "follow the sun onto the standby point; hold where none was reached yet",
+    "standby": "follow the sun onto the standby point; hold if it was never reached",
     "track": "follow the sun onto the aim",
     "search": "follow the sun onto a spiral about the aim",
-    "move": "go to ordered step counts",
+    "move": "go to the commanded step counts",
     "diagnose": "move each axis a short distance and back, and read the sensor",
 }
 
