@@ -21,6 +21,8 @@ _FLUX, _SHARE = "inferno", "cividis"
 #: Maximum number of heliostats drawn in three dimensions; in larger fields only every second,
 #: third, … is drawn.
 _MOST = 4000
+#: Lowest end of a scale of flux, kW/m², for receivers without light.
+_DARK = 1e-3
 #: Maximum number of receivers beside a map of the field.
 _RECEIVERS = 3
 
@@ -56,13 +58,13 @@ def receiver_map(
         )
     else:
         ax = _axes(ax)
-        mesh = ax.pcolormesh(
-            view.right, view.up, 1e-3 * view.flux, cmap=_FLUX, vmin=0.0, rasterized=True
-        )
+        mesh = ax.pcolormesh(view.right, view.up, 1e-3 * view.flux, cmap=_FLUX, rasterized=True)
+    mesh.set_clim(0.0, max(1e-3 * float(view.flux.max()), _DARK))
     ax.figure.colorbar(mesh, ax=ax, label="flux, kW/m²")
     ax.set_aspect("equal", adjustable="box")
     ax.set_title(
-        f"{view.receiver}: {1e-6 * view.power:.4g} MW, peak {1e-3 * view.flux.max():.4g} kW/m²",
+        f"{view.receiver}: {1e-6 * round(view.power):.4g} MW, "
+        f"peak {1e-3 * view.flux.max():.4g} kW/m²",
         fontsize=10,
     )
     ax.set_xlabel("right, m")
@@ -147,15 +149,15 @@ def flux_figure(found: PlantFlux, by: str = "total") -> "Figure":
     """Return a figure of the field's flux: map, up to `_RECEIVERS` receivers, and a 3-D view."""
     import matplotlib.pyplot as plt
 
-    figure = plt.figure(figsize=(13.0, 8.0), layout="constrained")
-    grid = figure.add_gridspec(2, 2)
-    efficiency_map(found, by, ax=figure.add_subplot(grid[:, 0]))
-    space = figure.add_subplot(grid[1, 1], projection="3d")
-    flux_3d(found, by, ax=space)
     pairs = list(zip(found.maps, found.surfaces, strict=True))[:_RECEIVERS]
-    places = grid[0, 1].subgridspec(1, len(pairs))
+    count = len(pairs)
+    figure = plt.figure(figsize=(13.0, 5.0 + 3.0 * count), layout="constrained")
+    grid = figure.add_gridspec(count + 1, 2)
+    efficiency_map(found, by, ax=figure.add_subplot(grid[:, 0]))
+    space = figure.add_subplot(grid[count, 1], projection="3d")
+    flux_3d(found, by, ax=space)
     for k, (view, surface) in enumerate(pairs):
-        receiver_map(view, surface=surface, ax=figure.add_subplot(places[0, k]))
+        receiver_map(view, surface=surface, ax=figure.add_subplot(grid[k, 1]))
     return figure
 
 
@@ -203,9 +205,10 @@ def _front_view(surface: Mesh | Cavity, view: FluxView) -> Any:
     order = np.argsort(cells.center @ front)
     order = order[cells.normal[order] @ front > 0.0]
     corners = (_faces(surface)[order] - surface.center) @ axes.T
-    drawn = PolyCollection(corners, cmap=_FLUX, linewidths=0.0, rasterized=True)
+    # Without smoothing and with edges of their own colour there are no seams between cells.
+    look = {"edgecolors": "face", "linewidths": 0.4, "antialiaseds": False, "rasterized": True}
+    drawn = PolyCollection(corners, cmap=_FLUX, **look)
     drawn.set_array(1e-3 * view.flux.ravel()[order])
-    drawn.set_clim(0.0, max(1e-3 * float(view.flux.max()), 1e-9))
     return drawn
 
 
