@@ -9,6 +9,10 @@ position with respect to the position on the part. Parts whose images are close 
 by their moments. Each image is convolved with the Gaussians of the slope errors and of the
 calibration uncertainty, and with a sum of Gaussians for the sun.
 
+The power of a part is its lit area in the mirror's plane times the cosine of the mirror. A curved
+mirror's lit edge leans to the sun or from it, but its sagitta, and that of the neighbour whose shadow
+ends there, offset this.
+
 Surfaces are columns of cells of equal height. Along a column the exponent is a quadratic form of
 the height, so each cell value costs two multiplications. The cell size counts as an additional
 variance.
@@ -173,8 +177,6 @@ def _images(
         tilt_x -= curve * (lit[1] - x)
         tilt_y -= curve * (lit[2] - y)
         _place(row, sun, ray, axes, t, lit[1], lit[2], tilt_x, tilt_y, place)
-        # The lit area lies in the mirror's plane, and so does the cosine: what a leaning edge
-        # receives in addition, the sagitta takes from the shadow beside it.
         power = lit[0] * cosine
         a, b, p, q = spread[0, 0], spread[0, 1], spread[1, 0], spread[1, 1]
         uu = a * a * lit[3] + 2.0 * a * b * lit[4] + b * b * lit[5]
