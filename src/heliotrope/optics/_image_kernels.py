@@ -9,9 +9,9 @@ position with respect to the position on the part. Parts whose images are close 
 by their moments. Each image is convolved with the Gaussians of the slope errors and of the
 calibration uncertainty, and with a sum of Gaussians for the sun.
 
-The power of a part is its lit area in the mirror's plane times the cosine of the mirror. A curved
-mirror's lit edge leans to the sun or from it, but its sagitta, and that of the neighbour whose shadow
-ends there, offset this.
+The power of a part is its lit area in the mirror's plane times the cosine of the mirror. The lit
+edge of a curved mirror leans to the sun or from it, but its sagitta, and that of the neighbour
+whose shadow ends there, offset this.
 
 Surfaces are columns of cells of equal height. Along a column the exponent is a quadratic form of
 the height, so each cell value costs two multiplications. The cell size counts as an additional
