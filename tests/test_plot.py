@@ -16,6 +16,8 @@ from matplotlib.patches import Ellipse
 import heliotrope as ht
 from heliotrope import plot
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.mesh import cavity_wall
+from heliotrope.field.target import Receiver
 from heliotrope.optics.beam import CHI_SQUARE_90
 
 AIM = (0.0, 0.0, 13.0)
@@ -178,6 +180,29 @@ def test_field_and_receiver_are_drawn_in_space(pyplot: object) -> None:
     assert len(ax.collections) == 2  # the heliostats and the cells of the receiver
     figure = plot.flux_figure(light(), "lit")
     assert len(figure.axes) == 5  # three pictures and two scales
+
+
+@cache
+def in_a_cavity() -> ht.optics.PlantFlux:
+    plant = ht.example_plant()
+    old = plant.receivers[0]
+    wall = cavity_wall(3.0, 2.6, 4.0, (10, 20))
+    cave = Receiver("cave", "cavity", old.center, old.normal, 4.0, 4.0, mesh=wall)
+    return ht.flux(replace(plant, receivers=(cave, old)), sun=(0.1, 0.6, 0.8))
+
+
+def test_a_cavity_is_drawn_from_its_front_and_each_receiver_has_its_map(pyplot: object) -> None:
+    found = in_a_cavity()
+    ax = plot.receiver_map(found.maps[0], surface=found.surfaces[0])
+    (cells,) = ax.collections
+    # The wall is hollow towards the front: all of it is seen, as wide as its opening.
+    assert len(cells.get_paths()) == found.maps[0].flux.size == 400
+    assert np.max(np.asarray(cells.get_array())) == pytest.approx(1e-3 * found.maps[0].flux.max())
+    bounds = cells.get_datalim(ax.transData)
+    assert (bounds.width, bounds.height) == pytest.approx((6.0 * np.sin(1.3), 4.0), rel=1e-6)
+    figure = plot.flux_figure(found)
+    titles = [ax.get_title().partition(":")[0] for ax in figure.axes]
+    assert {"cave", found.maps[1].receiver} <= set(titles)
 
 
 def test_without_axes_new_ones_are_made(pyplot: object) -> None:

@@ -365,7 +365,7 @@ ARGUMENTS: list[tuple[list[str], str]] = [
     ([*TRACK, "--aim", "0,0,9", "--target", "target"], "not both"),
     ([*TRACK, "--time", "2026-09-02T10:00"], "has no time zone"),
     ([*TRACK, "--time", "yesterday"], "is not ISO 8601"),
-    ([*TRACK, "--sun", "0,0,0"], "length 0 has no direction"),
+    ([*TRACK, "--sun", "0,0,0"], "write the sun vector as east,north,up"),
     ([*TRACK, "--every", "soon"], "write it as 30s, 5min or 1h"),
     ([*TRACK, "--every", "0s"], "from 1 s to 1000 h"),
     (["sun", "--latitude", "91"], "91"),

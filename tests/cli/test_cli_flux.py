@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 import heliotrope as ht
 from heliotrope.cli import main
 from heliotrope.field.tower import Tower
+from heliotrope.optics import FieldOptics
 
 SUN = "--sun=0.1,0.6,0.8"
 
@@ -64,6 +66,55 @@ def test_facets_are_canted_at_a_time(flux: Any) -> None:
     assert json.loads(out)["peak_w_m2"] == pytest.approx(known.peak)
 
 
+def test_without_sunlight_only_what_it_needs_is_unknown(flux: Any) -> None:
+    code, out, err = flux(SUN, "--dni=0")
+    assert code == 0, err
+    assert "cannot reach" not in out
+    assert "nan" not in out
+    (line,) = [line for line in out.splitlines() if line.strip().startswith("total")]
+    assert line.split() == ["total"]
+    code, out, _ = flux(SUN, "--dni=0", "--json")
+    assert code == 0
+    shares = json.loads(out)["efficiencies"]
+    assert shares["cosine"] > 0.7
+    assert shares["intercept"] is shares["total"] is None
+
+
+def test_a_receiver_beside_the_beams_gets_no_light(flux: Any) -> None:
+    file = Path("plant.toml")
+    text, first = file.read_text(), ht.open("plant.toml").receivers[0]
+
+    def with_another(normal: np.ndarray) -> tuple[int, str, str]:
+        center = (first.center + [9.0, 0.0, 0.0]).tolist()
+        file.write_text(
+            f'{text}\n[[receivers]]\nname = "beside"\nkind = "planar"\ncenter_m = {center}\n'
+            f"normal = {normal.tolist()}\nwidth_m = 3\nheight_m = 3\n"
+        )
+        return flux(SUN)  # type: ignore[no-any-return]
+
+    code, out, err = with_another(first.normal)
+    assert code == 0, err
+    assert "beside: 0 MW, peak 0 kW/m², 0.00 % of the light" in out
+    code, _, err = with_another(-first.normal)
+    assert code == 2
+    assert "receiver beside: no mirror sends light to it; turn the receiver" in err
+
+
+def test_off_axis_facets_face_the_receiver_that_they_are_for() -> None:
+    plant = ht.example_plant()
+    first = plant.receivers[0]
+    name, away = "other", first.center + [15.0, 0.0, 0.0]
+    other = replace(first, name=name, center=away, corners=None)
+    plant = replace(plant, receivers=(first, other))
+    light = FieldOptics(facets=(3, 2), canting=(0.1, 0.6, 0.8))
+    sun = np.array([0.1, 0.6, 0.8]) / np.linalg.norm([0.1, 0.6, 0.8])
+    given = light.scene(plant, sun, None, (name,)).mirrors
+    alone = light.scene(replace(plant, receivers=(other,)), sun, None, ()).mirrors
+    assert given.facets is not None
+    assert alone.facets is not None
+    np.testing.assert_allclose(given.facets.tilt, alone.facets.tilt, atol=1e-12)
+
+
 def test_files_are_written_and_named(flux: Any, tmp_path: Path) -> None:
     code, out, err = flux(
         SUN, "--csv=h.csv", "--map=m.csv", "--netcdf=f.nc", "--picture=p.png", "--by=cosine"
@@ -105,13 +156,23 @@ def test_a_day_and_a_year_are_tables(flux: Any, tmp_path: Path) -> None:
     ("words", "line"),
     [
         ((SUN, "--time=now"), "use --time or --sun, not both"),
-        (("--time=2026-09-02T22:00Z",), "above the horizon; choose a time in daylight"),
+        (("--time=2026-09-02T22:00Z",), "below the horizon; choose a time in daylight"),
         ((SUN, "--dni=-1"), "--dni"),
         ((SUN, "--air=fog"), "unknown air model 'fog'; known"),
         ((SUN, "--sun-shape=disk"), "sun shape 'disk'; known"),
         ((SUN, "--focus=near"), "--focus must be plant, slant, flat, or a focal"),
         ((SUN, "--facets=5"), "--facets '5': write COLUMNSxROWS, such as 5x7"),
+        (
+            (SUN, "--facets=100x7"),
+            "--facets '100x7': write COLUMNSxROWS, such as 5x7, from 1",
+        ),
         ((SUN, "--facets=5x7", "--canting=noon"), "time 'noon' is not ISO 8601"),
+        ((SUN, "--facets=5x7", "--canting=-4"), "--canting '-4': use slant, a focal length from"),
+        ((SUN, "--facets=5x7", "--canting=2026-03-20T00:00Z"), "below the horizon at that time"),
+        ((SUN, "--canting=60"), "--canting: applies to the facets of --facets; add --facets"),
+        (("--sun=0,0,0",), "--sun '0,0,0': write the sun vector as east,north,up"),
+        (("--sun=1,2",), "--sun '1,2': write the sun vector as east,north,up"),
+        ((SUN, "--csv=a.csv", "--map=a.csv"), "a.csv: two outputs have this name"),
         ((SUN, "--cells=0x4"), "--cells '0x4': write ROWSxCOLUMNS, such as 20x56"),
         ((SUN, "--tower=1,2,3"), "--tower '1,2,3': write four numbers in m"),
         ((SUN, "--tower=0,-24,30,9"), "of a tower of radius 30 m, inside it; correct either"),

@@ -5,7 +5,7 @@ import pytest
 
 from heliotrope.errors import InputError
 from heliotrope.field.tower import Tower
-from heliotrope.geometry import bisector, normalize
+from heliotrope.geometry import bisector, direction, normalize
 from heliotrope.optics.receiver_flux import FieldFlux
 from heliotrope.optics.scene import FacetTable, Mirrors, Scene
 from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, Surface
@@ -94,6 +94,39 @@ def test_slope_counts_four_times_in_the_plane_of_incidence_and_less_across() -> 
     assert found["slope"][1, 1] == pytest.approx(metre * (1.0 + 4.0 * 4.0 * 0.5), rel=5e-3)
     assert found["belief"][0, 0] == pytest.approx(metre * 2.0, rel=2e-2)
     assert found["belief"][1, 1] == pytest.approx(metre * 5.0, rel=1e-2)
+
+
+def on_paraboloid(given: Mirrors, row: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return points of a mirror's true surface, (..., 3)."""
+    z = (x * x + y * y) / (4.0 * given.focal[row])
+    parts = zip((x, y, z), (given.right[row], given.up[row], given.normal[row]), strict=True)
+    return given.center[row] + sum(value[..., None] * axis for value, axis in parts)
+
+
+def test_a_curved_mirror_in_shadow_receives_what_passes_its_plane() -> None:
+    """The edge that is still lit leans from the sun or to it; the sagitta makes up for it."""
+    sun, focal = direction(np.radians(270.0), np.radians(12.0)), 80.0
+    place = np.array([[0.0, 120.0, 0.0], [-7.0, 121.5, 0.0]])
+    normal = bisector(np.broadcast_to(sun, (2, 3)), normalize(AIM - place))
+    given = Mirrors.of(place, normal, (6.0, 6.0), AIM, focal=focal, reflectivity=1.0)
+    surface = Plate("plate", AIM, -EAST, UP, 40.0, 40.0)
+    found = FieldFlux(Scene(sun, 1000.0, given, (surface,)), air="none")
+    assert found.lit.blocking[0] == 1.0
+    assert found.lit.shading[0] < 0.6
+
+    line = (np.arange(1000) + 0.5) / 1000 * 6.0 - 3.0
+    x, y = np.meshgrid(line, line)
+    lean = (x * (given.right[0] @ sun) + y * (given.up[0] @ sun)) / (2.0 * focal)
+    # Where the rays to these points meet the neighbour's paraboloid.
+    away, depth = on_paraboloid(given, 0, x, y) - given.center[1], np.zeros_like(x)
+    for _ in range(20):
+        along = (depth - away @ given.normal[1]) / (given.normal[1] @ sun)
+        meets = away + along[..., None] * sun
+        across, upward = meets @ given.right[1], meets @ given.up[1]
+        depth = (across**2 + upward**2) / (4.0 * focal)
+    shaded = (along > 0.0) & (np.maximum(np.abs(across), np.abs(upward)) < 3.0)
+    truth = 36.0 * 1000.0 * float(np.mean((given.normal[0] @ sun - lean) * ~shaded))
+    assert found.leaving[0] == pytest.approx(truth, rel=1e-3)
 
 
 def test_a_focused_mirror_s_image_is_astigmatic() -> None:

@@ -114,6 +114,15 @@ def parse_point(text: str, what: str) -> tuple[float, float, float]:
     return east, north, up
 
 
+def parse_sun(text: str) -> tuple[float, float, float]:
+    """Return a sun vector from a text "E,N,U"; its length has no meaning, but is not 0."""
+    refusal = f"--sun {shown(text)}: write the sun vector as east,north,up, such as 0,-0.6,0.8"
+    east, north, up = parse_numbers(text, refusal, count=3)
+    if east == north == up == 0.0:
+        raise InputError(refusal)
+    return east, north, up
+
+
 def open_plant(path: Path, site: "Site | None" = None) -> "Plant":
     """Return the plant in a file or folder, whatever its format."""
     from heliotrope.field import formats

@@ -130,20 +130,33 @@ def _focus(text: str) -> Literal["plant", "slant", "flat"] | float:
 def _facets(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,2})x(\d{1,2})", text, re.ASCII)
     if match is None:
-        raise InputError(f"--facets {shown(text)}: write COLUMNSxROWS, such as 5x7")
+        raise InputError(
+            f"--facets {shown(text)}: write COLUMNSxROWS, such as 5x7, from 1 to 50 each way"
+        )
     return int(match[1]), int(match[2])
 
 
-def canting_of(text: str, plant: "Plant") -> Any:
+def canting_of(text: str, facets: tuple[int, int] | None, plant: "Plant") -> Any:
     """Return the canting of facets from "slant", a focal length, or a sun position."""
     from heliotrope.sun import vector
 
     if text == "slant":
         return text
-    if re.fullmatch(r"[\d.]+", text, re.ASCII):
+    if facets is None:
+        raise InputError(
+            "--canting: applies to the facets of --facets; add --facets COLUMNSxROWS, such as 5x7, "
+            "or specify the canting in the plant file"
+        )
+    if re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?", text, re.ASCII):
         refusal = f"--canting {shown(text)}: use slant, a focal length from 0.1 to 1e5 m, or a time"
         return parse_numbers(text, refusal, least=0.1, most=1e5)[0]
-    return vector(parse_time(text), plant.site)
+    light = vector(parse_time(text), plant.site)
+    if light[2] <= 0.0:
+        raise InputError(
+            f"--canting {shown(text)}: the sun is below the horizon at that time; choose a time in "
+            "daylight"
+        )
+    return light
 
 
 def _cells(text: str | None) -> tuple[int, int] | None:

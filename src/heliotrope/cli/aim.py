@@ -11,8 +11,8 @@ from heliotrope.cli._calibration import progress
 from heliotrope.cli._common import (
     open_plant,
     parse_numbers,
-    parse_point,
     parse_site,
+    parse_sun,
     parse_time,
     print_json,
     print_table,
@@ -133,10 +133,10 @@ def aim(
     if time is not None and sun is not None:
         raise InputError("use --time or --sun, not both")
     plant = open_plant(field, None if site is None else parse_site(site))
-    light = replace(light, canting=canting_of(canting, plant))
+    light = replace(light, canting=canting_of(canting, light.facets, plant))
     when = None if sun is not None else noon(plant) if time is None else parse_time(time)
     options: dict[str, Any] = {
-        "sun": None if sun is None else parse_point(sun, "sun"), "light": light, "limit": allowed,
+        "sun": None if sun is None else parse_sun(sun), "light": light, "limit": allowed,
         "probability": probability, "keep": keep_all,
         "wanted": _wanted(wanted), "give": 1e-2 * give_percent,
         "shared": SharedErrors(1e-3 * drift_mrad, clock_s, 1e-3 * cluster_mrad),

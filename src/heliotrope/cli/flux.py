@@ -1,5 +1,6 @@
 """``heliotrope flux``: the flux that each heliostat sends to the receiver, and its losses."""
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,6 +12,7 @@ from heliotrope.cli._common import (
     open_plant,
     parse_point,
     parse_site,
+    parse_sun,
     parse_time,
     print_json,
     print_table,
@@ -135,7 +137,7 @@ def flux(
     )
     order.check(field, table=every is not None or year, year=year)
     plant = open_plant(field, None if site is None else parse_site(site))
-    order = replace(order, light=replace(light, canting=canting_of(canting, plant)))
+    order = replace(order, light=replace(light, canting=canting_of(canting, light.facets, plant)))
     if year:
         _year(plant, order, any_of={"--time": time, "--sun": sun, "--every": every}, rays=rays)
     elif every is not None:
@@ -202,7 +204,7 @@ def _moment(
     if time is not None and sun is not None:
         raise InputError("use --time or --sun, not both")
     when = None if sun is not None else noon(plant) if time is None else parse_time(time)
-    options = {**order.options, "sun": None if sun is None else parse_point(sun, "sun")}
+    options = {**order.options, "sun": None if sun is None else parse_sun(sun)}
     with progress("casting beams", order.as_json) as step:
         step(0, 1)
         result = field_flux(plant, when, **options)
@@ -296,21 +298,23 @@ def _print_moment(result: "PlantFlux", second: "PlantFlux | None") -> None:
     for (name, words), share in zip(_WORDS.items(), shares, strict=True):
         known = share[np.isfinite(share)]
         ends = (f"{100 * x:.2f} %" for x in ((known.min(), known.max()) if known.size else ()))
-        row = [words, f"{100 * result.summary[name]:.2f} %", *ends]
+        row = [words, _percent(result.summary[name]), *ends]
         rows.append(row + [""] * (4 - len(row)))
         if second is not None:
-            rows[-1].append(f"{100 * second.summary[name]:.2f} %")
+            rows[-1].append(_percent(second.summary[name]))
     if second is not None:
         header.append("by rays")
     title = f"{result.plant}: sun {azimuth:.2f}° from north, {elevation:.2f}° high, "
     title += f"{result.dni:g} W/m² on {result.area.sum():,.0f} m²"
     print_table(header, rows, title=title)
     for view in result.maps:
-        print(
-            f"{view.receiver}: {1e-6 * view.power:.5g} MW, peak {1e-3 * view.flux.max():.5g} kW/m²,"
-            f" {100 * view.intercept:.2f} % of the light"
-        )
-    dark = int(np.isnan(result.efficiencies.total).sum())
+        # The sun's Gaussians leave a billionth of a beam beside its surface.
+        power = view.power if view.power > 1e-6 * result.power else 0.0
+        line = f"{view.receiver}: {1e-6 * power:.5g} MW, peak {1e-3 * view.flux.max():.5g} kW/m²"
+        if np.isfinite(view.intercept):
+            line += f", {100 * max(view.intercept, 0.0):.2f} % of the light"
+        print(line)
+    dark = int(np.isnan(result.efficiencies.cosine).sum())
     if dark:
         print(f"{dark} of {len(result.names)} heliostats cannot reach their aim")
     if second is not None:
@@ -321,6 +325,11 @@ def _print_moment(result: "PlantFlux", second: "PlantFlux | None") -> None:
             f"differ by {100 * said['cells_apart_of_peak']:.2f} % of the peak (RMS), the rays' own "
             f"noise is {100 * said['cells_noise_of_peak']:.2f} %"
         )
+
+
+def _percent(share: float) -> str:
+    """Return a share as text; "" without sunlight, where it is NaN."""
+    return f"{100 * share:.2f} %" if math.isfinite(share) else ""
 
 
 def _day(

@@ -170,7 +170,7 @@ class _PlanOrder:
 
 
 def check_outputs(outputs: tuple[Path | None, ...], field: Path, sightings: Path | None) -> None:
-    """Refuse an output that cannot be written, or that would replace an input."""
+    """Refuse an output that cannot be written, or that would replace an input or an output."""
     from heliotrope.files.documents import read_toml
 
     read = {path.resolve() for path in (field, sightings) if path is not None}
@@ -178,7 +178,11 @@ def check_outputs(outputs: tuple[Path | None, ...], field: Path, sightings: Path
         table = read_toml(field, "a plant file").get("heliostats")
         if isinstance(table, str):
             read.add((field.parent / table).resolve())
+    written: set[Path] = set()
     for file in (path for path in outputs if path is not None):
+        if file.resolve() in written:
+            raise InputError(f"{file}: two outputs have this name; choose another for one of them")
+        written.add(file.resolve())
         if not file.parent.is_dir():
             raise InputError(f"{file}: there is no folder {file.parent}; create it first")
         inside = field.is_dir() and field.resolve() in file.resolve().parents and file.exists()

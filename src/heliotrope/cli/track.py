@@ -10,6 +10,7 @@ from heliotrope.cli._common import (
     open_plant,
     parse_point,
     parse_site,
+    parse_sun,
     parse_time,
     print_json,
     print_table,
@@ -120,7 +121,7 @@ def track(
             raise typer.Exit(1)
         return
     own = _sun_of(field) if sun is None and time is None else None
-    direction = normalize(parse_point(sun, "sun"), "sun") if sun is not None else own
+    direction = normalize(parse_sun(sun)) if sun is not None else own
     vector = solar.vector(moment, plant.site) if direction is None else direction
     _check_sun(heliostat, vector, moment.isoformat() if direction is None else "")
     result = tracking.track(mechanism, vector, goal, local=local)

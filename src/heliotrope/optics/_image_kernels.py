@@ -9,6 +9,10 @@ position with respect to the position on the part. Parts whose images are close 
 by their moments. Each image is convolved with the Gaussians of the slope errors and of the
 calibration uncertainty, and with a sum of Gaussians for the sun.
 
+The power of a part is its lit area in the mirror's plane times the cosine of the mirror. The lit
+edge of a curved mirror leans to the sun or from it, but its sagitta, and that of the neighbour
+whose shadow ends there, offset this.
+
 Surfaces are columns of cells of equal height. Along a column the exponent is a quadratic form of
 the height, so each cell value costs two multiplications. The cell size counts as an additional
 variance.
@@ -127,10 +131,7 @@ def _spread(turn, axes, row, t, curve, into):
 
 @njit(**INNER)
 def _place(row, sun, ray, axes, t, x, y, tilt_x, tilt_y, into):
-    """Compute where the ray from (x, y) with a tilted normal meets the plane at t.
-
-    Also compute the cosine of the ray.
-    """
+    """Compute where the ray from (x, y) with a tilted normal meets the plane at t."""
     nx = row[9] + tilt_x * row[3] + tilt_y * row[6]
     ny = row[10] + tilt_x * row[4] + tilt_y * row[7]
     nz = row[11] + tilt_x * row[5] + tilt_y * row[8]
@@ -143,7 +144,6 @@ def _place(row, sun, ray, axes, t, x, y, tilt_x, tilt_y, into):
     qx, qy, qz = px + way * rx, py + way * ry, pz + way * rz
     for e in range(2):
         into[e] = qx * axes[e, 0] + qy * axes[e, 1] + qz * axes[e, 2]
-    return 0.5 * c * math.sqrt(length)
 
 
 @njit(**INNER)
@@ -176,8 +176,8 @@ def _images(
             x, y = 0.0, 0.0
         tilt_x -= curve * (lit[1] - x)
         tilt_y -= curve * (lit[2] - y)
-        c = _place(row, sun, ray, axes, t, lit[1], lit[2], tilt_x, tilt_y, place)
-        power = lit[0] * max(c, 0.0)
+        _place(row, sun, ray, axes, t, lit[1], lit[2], tilt_x, tilt_y, place)
+        power = lit[0] * cosine
         a, b, p, q = spread[0, 0], spread[0, 1], spread[1, 0], spread[1, 1]
         uu = a * a * lit[3] + 2.0 * a * b * lit[4] + b * b * lit[5]
         vv = p * p * lit[3] + 2.0 * p * q * lit[4] + q * q * lit[5]

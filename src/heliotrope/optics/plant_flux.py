@@ -135,7 +135,8 @@ class FieldOptics:
         )
         if self.facets is None:
             return scene
-        mirrors = canted(scene.mirrors, self.facets, self.canting, plant=plant, aim=aim)
+        ends = scene.mirrors.aim
+        mirrors = canted(scene.mirrors, self.facets, self.canting, plant=plant, aim=ends)
         return replace(scene, mirrors=mirrors)
 
     def engine(self, scene: Scene) -> FieldFlux:
@@ -275,6 +276,9 @@ def field_efficiencies(shares: Efficiencies, area: FloatArray) -> dict[str, floa
         light.append(light[-1] * np.nan_to_num(getattr(shares, stage)))
     light.append(np.nan_to_num(area * shares.total))
     sums = [float(item.sum()) for item in light]
+    if np.isnan(shares.total).all():
+        # Without sunlight nothing is known of what comes after the air.
+        sums[-1] = np.nan
 
     def share(part: float, whole: float) -> float:
         return part / whole if whole > 0.0 else float("nan")
@@ -396,7 +400,7 @@ def one_sun(plant: Plant, time: Times | None, sun: npt.ArrayLike | None) -> Floa
     if light[2] <= 0.0:
         elevation = np.degrees(np.arcsin(np.clip(light[2], -1.0, 1.0)))
         raise InputError(
-            f"flux: the sun stands {elevation:.1f}° above the horizon; choose a time in daylight"
+            f"flux: the sun stands {-elevation:.1f}° below the horizon; choose a time in daylight"
         )
     return light
 

@@ -175,9 +175,15 @@ class FieldFlux:
         self._cast(np.arange(len(mirrors)), 1.0)
 
     def check_met(self) -> None:
-        """Raise InputError if there are lit mirrors, but none sends light to a surface."""
-        for surface, power in zip(self.scene.surfaces, self._power, strict=True):
-            if power[:, 0].any() and not power[:, 1].any():
+        """Raise InputError if there are lit mirrors, but none sends light to the surfaces.
+
+        One of several surfaces may get no light, but must face a mirror.
+        """
+        pairs = zip(self.scene.surfaces, self._power, strict=True)
+        unmet = [s for s, power in pairs if power[:, 0].any() and not power[:, 1].any()]
+        for surface in unmet:
+            alone = len(unmet) == len(self.scene.surfaces)
+            if alone or not _faces_one(surface, self.scene.mirrors.center):
                 raise InputError(
                     f"receiver {surface.name}: no mirror sends light to it; turn the receiver "
                     "towards the field, or correct the aims"
@@ -550,6 +556,13 @@ def _hidden(
     corners = as_input(mesh.corners)
     run_blocks(lambda a, b: cell_kernels.hide(a, b, first, cells, corners, hidden), len(names), 2)
     return hidden, group
+
+
+def _faces_one(surface: Surface, places: FloatArray) -> bool:
+    """Whether a cell of a surface, or of its aperture, faces one of some places (H, 3)."""
+    cells = surface.aperture.cells if isinstance(surface, Cavity) else surface.cells
+    level = np.sum(cells.normal * cells.center, axis=-1)
+    return bool((cells.normal @ places.T > level[:, None]).any())
 
 
 def _plan(surface: Surface, scene: Scene) -> _Grid | _Cells:

@@ -341,7 +341,8 @@ def field_map(
             places[known, 0], places[known, 1], c=shown[known], s=size, cmap="cividis",
             vmin=low, vmax=top,
         )  # fmt: skip
-        ax.figure.colorbar(dots, ax=ax, label=label, extend="neither" if whole else "max")
+        scale = ax.figure.colorbar(dots, ax=ax, label=label, extend="neither" if whole else "max")
+        scale.formatter.set_useOffset(False)  # type: ignore[attr-defined]
     if len(names) == len(places) and known.sum() <= _NAMED:
         for i in np.flatnonzero(known):
             where = (float(places[i, 0]), float(places[i, 1]))

@@ -6,9 +6,10 @@ import numpy as np
 
 from heliotrope.aims.plan import AimPlan
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.geometry import normalize, tangent_axes
 from heliotrope.optics.flux import FluxView
 from heliotrope.optics.plant_flux import EFFICIENCIES, PlantFlux
-from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate
+from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, Surface
 from heliotrope.plot.charts import _axes, field_map
 
 if TYPE_CHECKING:
@@ -20,35 +21,50 @@ _FLUX, _SHARE = "inferno", "cividis"
 #: Maximum number of heliostats drawn in three dimensions; in larger fields only every second,
 #: third, … is drawn.
 _MOST = 4000
+#: Lowest end of a scale of flux, kW/m², for receivers without light.
+_DARK = 1e-3
+#: Maximum number of receivers beside a map of the field.
+_RECEIVERS = 3
 
 
-def receiver_map(view: FluxView, *, ax: "Axes | None" = None) -> "Axes":
-    """Draw the flux on a receiver; a cylinder is unrolled.
+def receiver_map(
+    view: FluxView, *, surface: Surface | None = None, ax: "Axes | None" = None
+) -> "Axes":
+    """Draw the flux on a receiver; a cylinder is unrolled, and a mesh seen from its front.
 
     Parameters
     ----------
     view
         One of `heliotrope.optics.PlantFlux.maps`.
+    surface
+        The one of `heliotrope.optics.PlantFlux.surfaces` at the same place; needed only for a mesh
+        or a cavity, whose map has no rows and columns.
     ax
         Axes to draw on; by default new axes.
 
     Raises
     ------
     InputError
-        If the receiver is a mesh, which has no rows and columns.
+        If the receiver is a mesh, and its surface was not passed.
     """
-    if len(view.up) < 2:
+    if isinstance(surface, Mesh | Cavity):
+        ax = _axes(ax)
+        mesh = ax.add_collection(_front_view(surface, view))
+        ax.autoscale_view()
+    elif len(view.up) < 2:
         raise InputError(
-            f"receiver {view.receiver}: a mesh cannot be unrolled; draw it with flux_3d"
+            f"receiver {view.receiver}: a mesh cannot be unrolled; pass its surface, or draw it "
+            "with flux_3d"
         )
-    ax = _axes(ax)
-    mesh = ax.pcolormesh(
-        view.right, view.up, 1e-3 * view.flux, cmap=_FLUX, vmin=0.0, rasterized=True
-    )
+    else:
+        ax = _axes(ax)
+        mesh = ax.pcolormesh(view.right, view.up, 1e-3 * view.flux, cmap=_FLUX, rasterized=True)
+    mesh.set_clim(0.0, max(1e-3 * float(view.flux.max()), _DARK))
     ax.figure.colorbar(mesh, ax=ax, label="flux, kW/m²")
     ax.set_aspect("equal", adjustable="box")
     ax.set_title(
-        f"{view.receiver}: {1e-6 * view.power:.4g} MW, peak {1e-3 * view.flux.max():.4g} kW/m²",
+        f"{view.receiver}: {1e-6 * round(view.power):.4g} MW, "
+        f"peak {1e-3 * view.flux.max():.4g} kW/m²",
         fontsize=10,
     )
     ax.set_xlabel("right, m")
@@ -130,16 +146,18 @@ def flux_3d(found: PlantFlux, by: str = "total", *, ax: "Any | None" = None) -> 
 
 
 def flux_figure(found: PlantFlux, by: str = "total") -> "Figure":
-    """Return a figure of the field's flux: map, first receiver unrolled, and a 3-D view."""
+    """Return a figure of the field's flux: map, up to `_RECEIVERS` receivers, and a 3-D view."""
     import matplotlib.pyplot as plt
 
-    figure = plt.figure(figsize=(13.0, 8.0), layout="constrained")
-    grid = figure.add_gridspec(2, 2)
+    pairs = list(zip(found.maps, found.surfaces, strict=True))[:_RECEIVERS]
+    count = len(pairs)
+    figure = plt.figure(figsize=(13.0, 5.0 + 3.0 * count), layout="constrained")
+    grid = figure.add_gridspec(count + 1, 2)
     efficiency_map(found, by, ax=figure.add_subplot(grid[:, 0]))
-    space = figure.add_subplot(grid[1, 1], projection="3d")
+    space = figure.add_subplot(grid[count, 1], projection="3d")
     flux_3d(found, by, ax=space)
-    if len(found.maps[0].up) > 1:
-        receiver_map(found.maps[0], ax=figure.add_subplot(grid[0, 1]))
+    for k, (view, surface) in enumerate(pairs):
+        receiver_map(view, surface=surface, ax=figure.add_subplot(grid[k, 1]))
     return figure
 
 
@@ -170,6 +188,28 @@ def aim_figure(plan: AimPlan) -> "Figure":
     )
     right.set_xlabel("right, m")
     return figure
+
+
+def _front_view(surface: Mesh | Cavity, view: FluxView) -> Any:
+    """Return the cells that are lit from the front, in metres right and up of the centre."""
+    from matplotlib.collections import PolyCollection
+
+    cells = surface.cells
+    if isinstance(surface, Cavity):
+        axes = np.stack([surface.aperture.right, surface.aperture.up])
+    else:
+        across, along = tangent_axes(normalize(cells.area @ cells.normal))
+        axes = np.stack([-across, along])
+    front = np.cross(axes[0], axes[1])
+    # Those further back first.
+    order = np.argsort(cells.center @ front)
+    order = order[cells.normal[order] @ front > 0.0]
+    corners = (_faces(surface)[order] - surface.center) @ axes.T
+    # Without smoothing and with edges of their own colour there are no seams between cells.
+    look = {"edgecolors": "face", "linewidths": 0.4, "antialiaseds": False, "rasterized": True}
+    drawn = PolyCollection(corners, cmap=_FLUX, **look)
+    drawn.set_array(1e-3 * view.flux.ravel()[order])
+    return drawn
 
 
 def _faces(surface: Plate | Cylinder | Mesh | Cavity) -> Any:
