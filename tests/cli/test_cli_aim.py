@@ -34,7 +34,8 @@ def aim(tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_strategies_stand_in_one_table_and_files_are_written(aim: Any) -> None:
     code, out, err = aim("--limit=120", "--strategy=all", "--csv=a.csv", "--picture=a.png")
     assert code == 0, err
-    for name in ("middle", "spread", "image-size", "optimal", "csv: a.csv", "picture: a.png"):
+    names = ("middle", "spread", "image-size", "gradient", "optimal")
+    for name in (*names, "csv: a.csv", "picture: a.png"):
         assert name in out
     with Path("a.csv").open(encoding="utf-8") as lines:
         rows = list(csv.DictReader(lines))

@@ -166,7 +166,8 @@ def plan_aims(
     limit
         W/m²: a number, a map, or a `FluxLimit`.
     strategy
-        "optimal"; or "middle", "spread" or "image-size" for comparison, which ignore the limit.
+        "optimal"; or for comparison "middle", "spread" or "image-size", which ignore the limit, or
+        "gradient", which may exceed it.
     probability
         Probability that the limit holds in all cells at once, 0.5 to 0.9999.
     shared

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from heliotrope.aims.candidates import Candidates, candidates, middles, surface_in
 from heliotrope.aims.errors import Risk, SharedErrors, assess, gains
+from heliotrope.aims.gradient import ascend
 from heliotrope.aims.optimiser import Choice, Step, optimise
 from heliotrope.aims.strategies import Strategy, choose
 from heliotrope.errors import InputError
@@ -155,7 +156,8 @@ def aim_scene(
     demand
         The limit, and the probability with which the limit must hold.
     strategy
-        One of `heliotrope.aims.STRATEGIES`; all but "optimal" ignore the limit.
+        One of `heliotrope.aims.STRATEGIES`. Only "optimal" keeps the limit; "gradient" may exceed
+        it, and the others ignore it.
     start
         Aims of the same mirrors and receiver at another sun, irradiance or limit, or with other
         mirrors in ``dark``: their images are used again, which takes a fraction of the time.
@@ -179,6 +181,8 @@ def aim_scene(
     else:
         base = FieldFlux(_posed(scene, start.aims, start.defocused), **light)
         field = _relit(start, base, scene)
+    if strategy == "gradient":
+        return _ascended(base.scene, field, demand, limit, progress, light)
     if strategy != "optimal":
         chosen = choose(field, base.scene, strategy)
         power = float(field.power[np.arange(len(chosen)), chosen].sum())
@@ -313,13 +317,46 @@ def _evaluated(
     off = choice.choice < 0
     aims = np.where(off[:, None], middles(scene), field.aims[rows, np.maximum(choice.choice, 0)])
     engine = FieldFlux(_posed(scene, aims, off), **light)
-    mirrors = engine.scene.mirrors
-    risk = Risk(np.zeros_like(limit), 0.0, np.zeros_like(limit))
-    if mirrors.pointing.any() or demand.shared.any:
-        groups = np.zeros(len(rows), dtype=np.int64) if demand.groups is None else demand.groups
-        modes = demand.shared.modes(mirrors, scene.sun, demand.pole)
-        width = float(np.median(field.width)) / np.sqrt(field.images.area)
-        risk = assess(engine, modes, groups, demand.probability, limit, width)
+    risk = _risk(engine, field, demand, limit)
+    return SceneAims(engine, field, choice, aims, off, limit, risk, light)
+
+
+def _risk(engine: FieldFlux, field: Candidates, demand: Demand, limit: FloatArray) -> Risk:
+    """Return the uncertainty of the flux."""
+    scene, mirrors = engine.scene, engine.scene.mirrors
+    if not (mirrors.pointing.any() or demand.shared.any):
+        return Risk(np.zeros_like(limit), 0.0, np.zeros_like(limit))
+    groups = np.zeros(len(mirrors), dtype=np.int64) if demand.groups is None else demand.groups
+    modes = demand.shared.modes(mirrors, scene.sun, demand.pole)
+    width = float(np.median(field.width)) / np.sqrt(field.images.area)
+    return assess(engine, modes, groups, demand.probability, limit, width)
+
+
+def _ascended(
+    scene: Scene,
+    field: Candidates,
+    demand: Demand,
+    limit: FloatArray,
+    progress: Step | None,
+    light: dict[str, Any],
+) -> SceneAims:
+    """Return the aims of gradient ascent, which begins with the strategy "spread"."""
+    rows, shifts = np.arange(len(field.weight)), field.shifts
+    up = shifts[rows, choose(field, scene, "spread") % shifts.shape[1]]
+    surface = surface_in(scene)
+    start = np.stack([np.zeros(len(up)), up * surface.height / surface.shape[0]], axis=-1)
+
+    def cap_of(engine: FieldFlux) -> FloatArray:
+        above = _risk(engine, field, demand, limit).above
+        return as_float(np.maximum(limit - above, LEAST * limit))
+
+    aims, prices = ascend(scene, cap_of, start, progress, **light)
+    # A choice that starts from these aims starts from the closest candidates.
+    chosen = np.linalg.norm(field.aims - aims[:, None], axis=-1).argmin(axis=1)
+    power = float(field.power[rows, chosen].sum())
+    choice = Choice(chosen, np.ascontiguousarray(prices.T), field.flux(chosen), power, np.nan)
+    engine = FieldFlux(_posed(scene, aims, None), **light)
+    off, risk = np.zeros(len(rows), dtype=np.bool_), _risk(engine, field, demand, limit)
     return SceneAims(engine, field, choice, aims, off, limit, risk, light)
 
 

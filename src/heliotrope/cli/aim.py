@@ -69,10 +69,8 @@ def aim(
         typer.Option(min=0.5, max=0.9999, help="Probability that the limit holds in all cells."),
     ] = 0.99,
     strategy: Annotated[
-        Literal["optimal", "middle", "spread", "image-size", "all"],
-        typer.Option(
-            help="The strategies other than optimal are for comparison and ignore the limit."
-        ),
+        Literal["optimal", "middle", "spread", "image-size", "gradient", "all"],
+        typer.Option(help="Only optimal keeps the limit; the others are for comparison."),
     ] = "optimal",
     keep_all: Annotated[
         bool, typer.Option("--keep-all", help="Fail rather than defocus a heliostat.")
