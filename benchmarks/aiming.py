@@ -12,6 +12,7 @@ the draws. Aims are chosen with the covariance, without the shared errors, and w
 
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -138,7 +139,8 @@ def by_gradient(given: Scene) -> dict[str, float]:
     for share in BUDGET:
         demand = Demand(FluxLimit(share * peak))
         best = aim_scene(given, demand, **LIGHT)
-        found, wall, _ = timed(lambda: aim_scene(given, demand, strategy="gradient", **LIGHT))
+        ascend = partial(aim_scene, given, demand, strategy="gradient", **LIGHT)
+        found, wall, _ = timed(ascend)
         name = f"gradient_{100 * share:.0f}_percent"
         figures[f"{name}_s"] = wall
         figures[f"{name}_over_limit_percent"] = 100.0 * found.excess
