@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,33 @@ def test_a_limit_over_temperature_and_velocity_lies_on_the_panels(aim: Any) -> N
     assert limit[-1, 0] == limit[0, -1] == 80000.0
     assert limit[0, 0] > 150000.0
     assert (flux <= limit).all()
+
+
+def test_with_two_receivers_each_heliostat_counts_for_its_own(aim: Any) -> None:
+    plant = ht.read_plant("plant.toml")
+    (first,) = plant.receivers
+    second = replace(first, name="second", center=first.center + [0.0, 0.0, 15.0])
+    (name,) = plant.groups
+    group = plant.groups[name]
+    own = np.where((np.arange(len(group)) % 3 == 0)[:, None], second.center, np.nan)
+    groups = {name: replace(group, aim=own)}
+    ht.write_plant(replace(plant, groups=groups, receivers=(first, second)), "plant.toml")
+    rows: dict[str, list[str]] = {}
+    for receiver, others in (("", 6), ("second", 12)):
+        code, out, err = aim("--limit=100", f"--receiver={receiver}", f"--csv={receiver}.csv")
+        assert code == 0, err
+        assert f"aims on {receiver or first.name}" in out
+        assert f"{others} heliostats belong to other receivers" in out
+        with Path(f"{receiver}.csv").open(encoding="utf-8") as lines:
+            rows[receiver] = [row["state"] for row in csv.DictReader(lines)]
+    on, off = {"aim", "defocus", "out of reach"}, {"other receiver"}
+    for k, (one, other) in enumerate(zip(rows[""], rows["second"], strict=True)):
+        assert one in (off if k % 3 == 0 else on)
+        assert other in (on if k % 3 == 0 else off)
+    ht.write_plant(replace(plant, receivers=(first, second)), "plant.toml")
+    code, out, err = aim("--limit=100", "--receiver=second")
+    assert code == 2
+    assert "none of the 18 heliostats can reach receiver second, and 18 belong to other" in err
 
 
 @pytest.mark.parametrize(

@@ -265,6 +265,8 @@ def _print(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> None:
     print_table(
         header, rows, title=f"{chosen.light.plant}: aims on {chosen.light.maps[0].receiver}"
     )
+    if chosen.elsewhere.any():
+        print(f"{int(chosen.elsewhere.sum()):,} heliostats belong to other receivers")
     binding = int(chosen.scene.binding.sum())
     print(f"{binding:,} of {chosen.limit.size:,} cells at the limit")
     best = np.argsort(-chosen.gain)[:NAMED]
