@@ -61,8 +61,14 @@ class AimPlan(Value, Framed):
     @property
     def aim(self) -> FloatArray:
         """Aims, ENU m, (N, 3); NaN for heliostats that are not to light this receiver."""
-        off = self.defocused | self.out_of_reach | self.elsewhere
+        off = self.defocused | self.out_of_reach | self.elsewhere | self.unlit
         return np.where(off[:, None], np.nan, self.light.aim)
+
+    @property
+    def unlit(self) -> npt.NDArray[np.bool_]:
+        """Heliostats that send no light to any cell of the receiver, wherever they aim, (N,)."""
+        dark = self.scene.field.power.max(axis=1) <= 0.0
+        return np.asarray(dark & ~self.out_of_reach & ~self.elsewhere)
 
     @property
     def power(self) -> float:
@@ -233,7 +239,8 @@ def plan_aims(
     begin = None if start is None else start.scene
     aimed = aim_scene(scene, demand, strategy=strategy, start=begin, progress=progress, **options)
     result = result_of(plant, aimed.engine.scene, aimed.engine)
-    defocused, unlimited = aimed.defocused & ~off, aimed.field.middle_power
+    lit = aimed.field.power.max(axis=1) > 0.0
+    defocused, unlimited = aimed.defocused & ~off & lit, aimed.field.middle_power
     return AimPlan(strategy, result, defocused, beyond & ~others, others, unlimited, aimed)
 
 

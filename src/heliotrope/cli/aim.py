@@ -267,6 +267,11 @@ def _print(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> None:
     )
     if chosen.elsewhere.any():
         print(f"{int(chosen.elsewhere.sum()):,} heliostats belong to other receivers")
+    if chosen.unlit.any():
+        first = chosen.names[int(chosen.unlit.argmax())]
+        print(
+            f"{int(chosen.unlit.sum()):,} heliostats reach no cell of the receiver, {first} first"
+        )
     binding = int(chosen.scene.binding.sum())
     print(f"{binding:,} of {chosen.limit.size:,} cells at the limit")
     best = np.argsort(-chosen.gain)[:NAMED]
