@@ -76,7 +76,8 @@ COARSE = Stepping((32, 32))
 _COARSE_DAYS, _UNSURVEYED, _BESIDE = 1.0 / 3.0, 1.0 / 3.0, (0.018, 0.022)
 #: Fraction of the days on which a mirror is covered, so that it reflects no light.
 _COVERED = 0.25
-#: Fraction of the runs of `mixed` that are only a working day; the same for repairs.
+#: Fraction of the runs of `mixed` that are only a working day; about the same for repairs, and for
+#: a flux limit.
 ALONE_SHARE = 0.1
 
 
@@ -98,7 +99,7 @@ def mixed(seed: int) -> tuple[str, ...]:
 
     These are some of `MIX`, rarely with a world of `RARE`, or a single world.
     """
-    for alone in (DAYS, REPAIRS):
+    for alone in (DAYS, REPAIRS, LIMIT):
         if random.Random(f"{alone} {seed}").random() < ALONE_SHARE:
             return (alone,)
     chance = random.Random(f"worlds {seed}")
