@@ -53,7 +53,7 @@ RAMP_ERROR = 0.05
 LIGHTS = ("TRACK", "REFOCUS", "AIM")
 
 
-class Sky(Protocol):
+class TrueSky(Protocol):
     """The true direct irradiance, W/m²: without clouds, and at present."""
 
     clear: float
@@ -77,7 +77,7 @@ class FluxObserver(Judge):
         The true irradiance.
     """
 
-    def __init__(self, start: float, boards: Sequence[Board], design: Plant, sky: Sky) -> None:
+    def __init__(self, start: float, boards: Sequence[Board], design: Plant, sky: TrueSky) -> None:
         super().__init__(start)
         self._sky = sky
         #: Times, s, and the flux of the cells in the irradiance of these times, W/m².
