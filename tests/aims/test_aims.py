@@ -14,10 +14,11 @@ from heliotrope.aims import (
     SceneAims,
     SharedErrors,
     aim_scene,
+    gradient,
     ramp_up,
     read_limit,
 )
-from heliotrope.aims.candidates import candidates
+from heliotrope.aims.candidates import candidates, on_receiver
 from heliotrope.aims.optimiser import bound, optimise
 from heliotrope.aims.scene_aims import deviation
 from heliotrope.errors import FormatError, InputError, UnknownNameError
@@ -115,6 +116,53 @@ def test_prices_far_from_the_best_bound_it_too(scene: Scene, peak: float) -> Non
     assert got.gap < 5e-3
     for scale in (0.0, 0.5, 2.0):
         assert bound(found, cap, scale * got.prices)[0] >= got.power
+
+
+@pytest.mark.parametrize("surface", [CYLINDER, PLATE])
+def test_the_gradient_is_that_of_moved_aims(surface: Surface) -> None:
+    given, rng = field(40, surface), np.random.default_rng(3)
+    worth = rng.uniform(-1.0, 1.0, surface.shape)
+    place = rng.uniform(-0.4, 0.4, (40, 2))
+
+    def engine(displaced: Any) -> FieldFlux:
+        aims = on_receiver(given, displaced)
+        return FieldFlux(given.with_mirrors(given.mirrors.toward(SUN, aims)))
+
+    slope, step = gradient._uphill(engine(place), place, worth), 0.02
+    for row, axis in ((3, 0), (17, 1), (30, 0)):
+        alone = replace(given, dark=np.arange(40) != row)
+        sums = []
+        for sign in (1.0, -1.0):
+            moved = place.copy()
+            moved[row, axis] += sign * step
+            lit = replace(alone, mirrors=given.mirrors.toward(SUN, on_receiver(given, moved)))
+            sums.append(float((FieldFlux(lit).maps[0] * worth).sum()))
+        area = float(surface.cells.area[0])
+        change = area * (sums[0] - sums[1]) / (2.0 * step)
+        assert slope[row, axis] == pytest.approx(change, abs=0.05 * np.abs(slope).max())
+
+
+def test_gradient_ascent_is_near_the_optimum_and_the_limit(scene: Scene, peak: float) -> None:
+    demand = Demand(FluxLimit(0.3 * peak))
+    spread = aim_scene(scene, demand, strategy="spread")
+    got = aim_scene(scene, demand, strategy="gradient")
+    best = aim_scene(scene, demand)
+    assert spread.excess > 0.05 > 0.02 > got.excess
+    assert got.engine.powers[0] > 0.99 * best.engine.powers[0]
+    assert not got.defocused.any()
+    again = aim_scene(scene, demand, start=got)
+    assert again.excess <= 0.0
+    assert again.engine.powers[0] > 0.98 * best.engine.powers[0]
+
+
+def test_gradient_ascent_leaves_room_for_errors(scene: Scene, peak: float) -> None:
+    own = np.tile(4e-4**2 * np.eye(2), (300, 1, 1))
+    given = replace(scene, mirrors=replace(scene.mirrors, pointing=own))
+    demand = Demand(FluxLimit(0.35 * peak), 0.95, SharedErrors(drift=3e-4))
+    got = aim_scene(given, demand, strategy="gradient")
+    sharp = aim_scene(scene, Demand(FluxLimit(0.35 * peak)), strategy="gradient")
+    assert got.excess < 0.03
+    assert got.engine.maps[0].max() < 0.97 * sharp.engine.maps[0].max()
 
 
 @pytest.fixture(scope="module")

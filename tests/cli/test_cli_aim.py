@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,8 @@ def aim(tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_strategies_stand_in_one_table_and_files_are_written(aim: Any) -> None:
     code, out, err = aim("--limit=120", "--strategy=all", "--csv=a.csv", "--picture=a.png")
     assert code == 0, err
-    for name in ("middle", "spread", "image-size", "optimal", "csv: a.csv", "picture: a.png"):
+    names = ("middle", "spread", "image-size", "gradient", "optimal")
+    for name in (*names, "csv: a.csv", "picture: a.png"):
         assert name in out
     with Path("a.csv").open(encoding="utf-8") as lines:
         rows = list(csv.DictReader(lines))
@@ -86,10 +88,59 @@ def test_a_limit_over_temperature_and_velocity_lies_on_the_panels(aim: Any) -> N
     assert (flux <= limit).all()
 
 
+def test_heliostats_that_reach_no_cell_are_named(aim: Any) -> None:
+    plant = ht.read_plant("plant.toml")
+    (first,) = plant.receivers
+    sideways = replace(first, normal=np.array([1.0, 0.0, 0.0]), corners=None)
+    ht.write_plant(replace(plant, receivers=(sideways,)), "plant.toml")
+    code, out, err = aim("--limit=200", "--csv=a.csv")
+    assert code == 0, err
+    with Path("a.csv").open(encoding="utf-8") as lines:
+        rows = {row["heliostat"]: row for row in csv.DictReader(lines)}
+    names = [name for name, row in rows.items() if row["state"] == "reaches no cell"]
+    assert f"{len(names)} heliostats reach no cell of the receiver, {names[0]} first" in out
+    (group,) = plant.groups.values()
+    east = dict(zip(plant.names, group.mechanism.position[:, 0] - first.center[0], strict=True))
+    assert {name for name, x in east.items() if x < -3.0} <= set(names)
+    assert all(east[name] < 3.0 for name in names)
+    assert not any(rows[name]["east_m"] for name in names)
+
+
+def test_with_two_receivers_each_heliostat_counts_for_its_own(aim: Any) -> None:
+    plant = ht.read_plant("plant.toml")
+    (first,) = plant.receivers
+    second = replace(first, name="second", center=first.center + [0.0, 0.0, 15.0])
+    (name,) = plant.groups
+    group = plant.groups[name]
+    own = np.where((np.arange(len(group)) % 3 == 0)[:, None], second.center, np.nan)
+    groups = {name: replace(group, aim=own)}
+    ht.write_plant(replace(plant, groups=groups, receivers=(first, second)), "plant.toml")
+    rows: dict[str, list[str]] = {}
+    for receiver, others in (("", 6), ("second", 12)):
+        code, out, err = aim("--limit=100", f"--receiver={receiver}", f"--csv={receiver}.csv")
+        assert code == 0, err
+        assert f"aims on {receiver or first.name}" in out
+        assert f"{others} heliostats belong to other receivers" in out
+        with Path(f"{receiver}.csv").open(encoding="utf-8") as lines:
+            rows[receiver] = [row["state"] for row in csv.DictReader(lines)]
+    on, off = {"aim", "defocus", "out of reach"}, {"other receiver"}
+    for k, (one, other) in enumerate(zip(rows[""], rows["second"], strict=True)):
+        assert one in (off if k % 3 == 0 else on)
+        assert other in (on if k % 3 == 0 else off)
+    ht.write_plant(replace(plant, receivers=(first, second)), "plant.toml")
+    code, out, err = aim("--limit=100", "--receiver=second")
+    assert code == 2
+    assert "none of the 18 heliostats can reach receiver second, and 18 belong to other" in err
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (("--limit=5", "--keep-all"), "no aims were found that respect the flux limit"),
+        (("--limit=5", "--keep-all"), "no aims were found that respect the flux limit; row "),
+        (("--limit=0.1",), "does not allow even the beam with the lowest peak; row "),
+        (("--limit=0.1",), "% above its 0.099; raise the limit there to "),
+        (("--limit=zero.csv",), "zero.csv: line 2, column 1: the flux must be above 0"),
+        (("--limit=ragged.csv",), "line 2: this row has 1 numbers, but earlier rows have 2"),
         (("--limit=much",), "--limit 'much': use 0.001 to 64000 kW/m²"),
         (("--limit=none.csv",), "none.csv"),
         (("--limit=none.csv", "--panels=panels.csv"), "none.csv"),
@@ -99,6 +150,8 @@ def test_a_limit_over_temperature_and_velocity_lies_on_the_panels(aim: Any) -> N
     ],
 )
 def test_bad_input_is_one_line_and_code_2(aim: Any, words: tuple[str, ...], line: str) -> None:
+    Path("zero.csv").write_text("1e5,2e5\n0,1e5\n", encoding="utf-8")
+    Path("ragged.csv").write_text("1e5,2e5\n1e5\n", encoding="utf-8")
     code, _, err = aim(*words)
     assert code == 2
     assert line in err

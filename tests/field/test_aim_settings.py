@@ -109,3 +109,8 @@ def test_what_cannot_be_is_refused_in_one_line(
 def test_a_limit_needs_one_receiver() -> None:
     with pytest.raises(InputError, match="needs one receiver, and the plant has 0"):
         replace(lay_out("radial", 6), receivers=(), aims=NUMBER)
+    plant = lay_out("radial", 6)
+    (first,) = plant.receivers
+    both = (first, replace(first, name="second", center=first.center + [0.0, 0.0, 20.0]))
+    with pytest.raises(InputError, match=r"the plant has 2; .* heliotrope aim for one receiver"):
+        replace(plant, receivers=both, aims=NUMBER)

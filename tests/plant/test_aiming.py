@@ -43,6 +43,8 @@ def played(
     work: Callable[[LivePlant], Awaitable[None]],
     limit: float = LIMIT,
     sensors: tuple[str, ...] = (),
+    *,
+    sideways: bool = False,
     **changes: object,
 ) -> None:
     """Run a small field in virtual time, with a flux limit."""
@@ -66,6 +68,9 @@ def played(
 
     (receiver,) = design.receivers
     receivers = (replace(receiver, nominal_power=NOMINAL),)
+    if sideways:
+        east = np.array([1.0, 0.0, 0.0])
+        receivers = (replace(receivers[0], normal=east, corners=None),)
     design = replace(design, groups={name: group}, aims=aims, receivers=receivers)
     play(later, design, options)
 
@@ -206,9 +211,47 @@ def test_a_limit_that_no_aims_hold_keeps_the_field_at_standby_with_an_alarm() ->
         assert (view.aimed, view.resting) == (0, COUNT)
         (alarm,) = [a for a in made.operations.logbook.alarms() if a.condition == "aims"]
         assert alarm.active
-        assert "allows not even one beam" in alarm.text
+        assert "does not allow even the beam with the lowest peak; row " in alarm.text
+        assert "above its 0.095; raise the limit there to " in alarm.text
+        assert "\n" not in alarm.text
 
     played(scene, 100.0)
+
+
+def test_a_limit_that_no_aims_hold_later_leaves_the_last_good_aims(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        await asyncio.sleep(40.0)
+        aims = made.operations._aiming._automatic.aims
+        before = set(aims)
+        assert before
+        with monkeypatch.context() as patch:
+            patch.setattr(aiming.Aiming, "_allowed", lambda self, limit, scene: FluxLimit(100.0))
+            await asyncio.sleep(40.0)
+        view = made.operations.aims()
+        assert view.source == "last good aims"
+        assert "does not allow even the beam" in view.problem
+        assert set(aims) == before
+        await asyncio.sleep(30.0)
+        assert made.operations.aims().source == "optimiser"
+
+    played(scene)
+
+
+def test_heliostats_that_reach_no_cell_are_named_and_stay_at_standby() -> None:
+    async def scene(made: LivePlant) -> None:
+        await asyncio.sleep(90.0)
+        east = made.plant.beams.position[:, 0]
+        behind = {name for name, x in zip(made.plant.field.names, east, strict=True) if x < -1.0}
+        assert behind
+        assert set(made.operations.aims().unlit) == behind
+        on = made.plant.field.among((states.TRACKING,), made.plant.now())
+        assert behind.isdisjoint(np.array(made.plant.field.names)[on])
+        assert on.any()
+
+    played(scene, sideways=True)
 
 
 def test_without_answers_the_last_good_aims_stay_and_then_the_safe_spread(

@@ -11,6 +11,7 @@ from heliotrope.errors import InputError
 from heliotrope.field.mirror_surface import MirrorSurface
 from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray, normalize
+from heliotrope.lcu import states
 from heliotrope.optics import (
     Cavity,
     Cylinder,
@@ -57,6 +58,24 @@ def test_it_is_what_the_library_says_of_the_same_mirrors(surface: MirrorSurface 
         assert 0.0 < shown.power_sigma < shown.power
 
     live(scene, AutomaticSettings(wanted=True), surface=surface)
+
+
+def test_after_a_start_the_flux_is_unknown_until_the_heliostats_have_reported() -> None:
+    async def scene(made: LivePlant) -> None:
+        field, flux = made.plant.field, made.operations._flux
+        assert (await made.operations.receiver_flux()).power == 0.0
+        flux._begun = made.plant.now()
+        field.heard[:2] = -np.inf
+        field.rows["state"][2], field.counted_at[2] = states.TRACKING, -np.inf
+        with pytest.raises(RefusedError, match="not yet known; 3 of 4 heliostats have not yet"):
+            await made.operations.receiver_flux()
+        await asyncio.sleep(4.0)
+        assert (await made.operations.receiver_flux()).power == 0.0
+        field.heard[:2] = -np.inf
+        flux._begun = made.plant.now() - 61.0
+        assert (await made.operations.receiver_flux()).power == 0.0, "a lost cluster hides nothing"
+
+    live(scene, AutomaticSettings())
 
 
 @pytest.mark.parametrize("error", [InputError("the process has ended"), ValueError("a defect")])

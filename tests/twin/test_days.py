@@ -37,7 +37,7 @@ from heliotrope.twin.world.acts import Acts
 from heliotrope.twin.world.operator import ENGINEER
 from heliotrope.twin.world.scene import TARGETS, scene_of
 from heliotrope.twin.world.simulation import SETTINGS, RunPlan, run
-from heliotrope.twin.world.worlds import ALONE_SHARE, DAY, DAYS, covered_by, length_of, mixed
+from heliotrope.twin.world.worlds import ALONE_SHARE, DAY, DAYS, LIMIT, covered_by, length_of, mixed
 
 #: High enough for every day, above no limit.
 ZENITH = np.array([0.0, 0.0, 1.0])
@@ -63,6 +63,9 @@ def test_a_day_is_some_of_any_and_has_its_own_length() -> None:
     days = [worlds for worlds in drawn if DAYS in worlds]
     assert all(worlds == (DAYS,) for worlds in days)
     assert 0.5 * ALONE_SHARE < len(days) / 400 < 1.5 * ALONE_SHARE
+    limits = [worlds for worlds in drawn if LIMIT in worlds]
+    assert all(worlds == (LIMIT,) for worlds in limits)
+    assert 0.4 * ALONE_SHARE < len(limits) / 400 < 1.5 * ALONE_SHARE
     assert length_of((DAYS,), None) == DAY
     assert length_of((DAYS,), 0.5) == 1800.0
     assert length_of(("visits",), None) == 360.0

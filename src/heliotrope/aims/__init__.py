@@ -7,8 +7,8 @@
   power.
 - `errors`: the uncertainty of the flux due to each mirror's own error and to shared errors.
 - `ramp`: when each mirror joins along a ramp; `heating`: how far a receiver may be heated now.
-- `scene_aims`: aims for a scene; `plan`: aims for a plant; `strategies`: simpler strategies for
-  comparison.
+- `scene_aims`: aims for a scene; `plan`: aims for a plant; `strategies` and `gradient`: other
+  strategies for comparison.
 
 Begin with `plan_aims`, which is `heliotrope.aim`.
 """

@@ -141,6 +141,32 @@ def _across(scene: Scene, offset: FloatArray) -> FloatArray:
     return as_float(surface.center + surface.radius * surface.outward(angle))
 
 
+def regions(scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the beams' standard deviations at the receiver, and how far aims may be displaced.
+
+    The displacements are to either side and up or down from `middles`; all three are in m, (H,).
+    """
+    surface, mirrors = surface_in(scene), scene.mirrors
+    angle = SUN_SIGMA**2 + 4.0 * mirrors.slope**2
+    angle = angle + 0.5 * np.trace(mirrors.pointing, axis1=1, axis2=2)
+    width = as_float(mirrors.slant * np.sqrt(angle))
+    room = np.maximum(0.5 * surface.height - WITHIN * width, 0.0)
+    if isinstance(surface, Plate):
+        return width, np.maximum(0.5 * surface.width - WITHIN * width, 0.0), room
+    return width, np.full(len(mirrors), ASIDE * surface.radius), room
+
+
+def axis_of(surface: Plate | Cylinder) -> FloatArray:
+    """Return the direction in which a receiver's height is measured, (3,)."""
+    return surface.up if isinstance(surface, Plate) else surface.axis
+
+
+def on_receiver(scene: Scene, place: FloatArray) -> FloatArray:
+    """Return points displaced from `middles` to the right and up by ``place`` (H, 2), m, (H, 3)."""
+    across = _across(scene, place[:, :1])[:, 0]
+    return as_float(across + place[:, 1:] * axis_of(surface_in(scene)))
+
+
 def candidates(engine: FieldFlux) -> Candidates:
     """Return the candidates of the mirrors of a scene with one receiver.
 
@@ -157,20 +183,13 @@ def candidates(engine: FieldFlux) -> Candidates:
     """
     scene = engine.scene
     surface, mirrors = surface_in(scene), scene.mirrors
-    angle = SUN_SIGMA**2 + 4.0 * mirrors.slope**2
-    angle = angle + 0.5 * np.trace(mirrors.pointing, axis1=1, axis2=2)
-    width = mirrors.slant * np.sqrt(angle)
+    width, far, room = regions(scene)
     rows, step = surface.shape[0], surface.height / surface.shape[0]
-    room = np.maximum(0.5 * surface.height - WITHIN * width, 0.0)
     shifts = np.round(np.linspace(-1.0, 1.0, HEIGHTS) * room[:, None] / step).astype(np.int64)
-    if isinstance(surface, Plate):
-        far, count = np.maximum(0.5 * surface.width - WITHIN * width, 0.0), ACROSS
-    else:
-        far, count = np.full(len(mirrors), ASIDE * surface.radius), AROUND
+    count = ACROSS if isinstance(surface, Plate) else AROUND
     looks = _across(scene, np.linspace(-1.0, 1.0, count) * far[:, None])
     images = engine.images(looks, np.abs(shifts).max(axis=1))
-    axis = surface.up if isinstance(surface, Plate) else surface.axis
-    aims = looks[:, :, None, :] + (step * shifts)[:, None, :, None] * axis
+    aims = looks[:, :, None, :] + (step * shifts)[:, None, :, None] * axis_of(surface)
     aims = as_float(aims.reshape(len(mirrors), -1, 3))
     empty = np.zeros(aims.shape[:2])
     built = Candidates(images, np.ones(len(mirrors)), shifts, aims, empty, width)

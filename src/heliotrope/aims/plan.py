@@ -1,7 +1,7 @@
 """Aims of a plant's heliostats under a flux limit, and other strategies for comparison."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,8 @@ class AimPlan(Value, Framed):
         Heliostats that are defocused, (N,).
     out_of_reach
         Heliostats that cannot reach the receiver, (N,).
+    elsewhere
+        Heliostats that belong to another receiver, (N,).
     unlimited
         Power with every heliostat aimed at the middle of the receiver, W.
     scene
@@ -47,6 +49,7 @@ class AimPlan(Value, Framed):
     light: PlantFlux
     defocused: npt.NDArray[np.bool_]
     out_of_reach: npt.NDArray[np.bool_]
+    elsewhere: npt.NDArray[np.bool_]
     unlimited: float
     scene: SceneAims
 
@@ -57,9 +60,15 @@ class AimPlan(Value, Framed):
 
     @property
     def aim(self) -> FloatArray:
-        """Aims, ENU m, (N, 3); NaN for defocused heliostats."""
-        off = self.defocused | self.out_of_reach
+        """Aims, ENU m, (N, 3); NaN for heliostats that are not to light this receiver."""
+        off = self.defocused | self.out_of_reach | self.elsewhere | self.unlit
         return np.where(off[:, None], np.nan, self.light.aim)
+
+    @property
+    def unlit(self) -> npt.NDArray[np.bool_]:
+        """Heliostats that send no light to any cell of the receiver, wherever they aim, (N,)."""
+        dark = self.scene.field.power.max(axis=1) <= 0.0
+        return np.asarray(dark & ~self.out_of_reach & ~self.elsewhere)
 
     @property
     def power(self) -> float:
@@ -162,11 +171,13 @@ def plan_aims(
     time, sun
         Exactly one of the two, as for `heliotrope.optics.field_flux`.
     receiver
-        Name; "": the plant's first.
+        Name; "": the plant's first. If the plant has several receivers, a heliostat belongs to the
+        one to which its aim in the plant file is closest, or to the first without such an aim.
     limit
         W/m²: a number, a map, or a `FluxLimit`.
     strategy
-        "optimal"; or "middle", "spread" or "image-size" for comparison, which ignore the limit.
+        "optimal"; or for comparison "middle", "spread" or "image-size", which ignore the limit, or
+        "gradient", which may exceed it.
     probability
         Probability that the limit holds in all cells at once, 0.5 to 0.9999.
     shared
@@ -202,8 +213,16 @@ def plan_aims(
     chosen = receiver or plant.receivers[0].name
     middle = plant.receiver(chosen).center
     scene = optics.scene(plant, one_sun(plant, time, sun), middle, (chosen,))
-    if scene.dark is not None and scene.dark.all():
-        raise InputError(f"aims: none of the {len(plant)} heliostats can reach the receiver")
+    others = _elsewhere(plant, chosen)
+    beyond = np.zeros_like(others) if scene.dark is None else scene.dark
+    off = beyond | others
+    if off.all():
+        belong = f", and {others.sum()} belong to other receivers" if others.any() else ""
+        raise InputError(
+            f"aims: none of the {len(plant)} heliostats can reach receiver {chosen}{belong}; "
+            "choose another receiver or sun position"
+        )
+    scene = replace(scene, dark=off)
     clusters = [name for group in plant.groups.values() for name in group.cluster]
     latitude = np.radians(plant.site.latitude_deg)
     demand = Demand(
@@ -219,9 +238,21 @@ def plan_aims(
     options = {"sun": optics.shape, "air": optics.air, "gaussians": optics.gaussians}
     begin = None if start is None else start.scene
     aimed = aim_scene(scene, demand, strategy=strategy, start=begin, progress=progress, **options)
-    off = np.zeros(len(plant), dtype=np.bool_) if scene.dark is None else scene.dark
     result = result_of(plant, aimed.engine.scene, aimed.engine)
-    return AimPlan(strategy, result, aimed.defocused & ~off, off, aimed.field.middle_power, aimed)
+    lit = aimed.field.power.max(axis=1) > 0.0
+    defocused, unlimited = aimed.defocused & ~off & lit, aimed.field.middle_power
+    return AimPlan(strategy, result, defocused, beyond & ~others, others, unlimited, aimed)
+
+
+def _elsewhere(plant: Plant, receiver: str) -> npt.NDArray[np.bool_]:
+    """Return a mask of the heliostats that belong to another receiver than the given one, (N,)."""
+    centers = np.array([each.center for each in plant.receivers])
+    own = [
+        g.aim if g.aim is not None else np.full((len(g), 3), np.nan) for g in plant.groups.values()
+    ]
+    away = np.linalg.norm(np.concatenate(own)[:, None] - centers, axis=-1)
+    nearest = np.nan_to_num(away).argmin(axis=1)
+    return np.asarray(nearest != [each.name for each in plant.receivers].index(receiver))
 
 
 def compare_aims(plans: Mapping[Any, AimPlan]) -> list[dict[str, Any]]:

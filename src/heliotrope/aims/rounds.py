@@ -9,7 +9,7 @@ this level must not get more light. The heliostats whose moves relieve the fulle
 first. If no move is possible, some heliostats rest and return later at other aims.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -132,6 +132,8 @@ class Answer:
         Mirrors whose aims are not yet the best ones.
     waiting
         Mirrors that only the ramp keeps from joining.
+    unlit
+        Free mirrors that send no light to any cell, wherever they aim, (K,).
     """
 
     moves: tuple[Move, ...]
@@ -144,6 +146,7 @@ class Answer:
     gap: float
     left: int
     waiting: int = 0
+    unlit: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
     @property
     def excess(self) -> float:
@@ -214,6 +217,7 @@ def next_round(now: Round, **light: Any) -> Answer:
         best.choice.gap,
         remaining,
         waiting,
+        np.flatnonzero(now.free & (best.field.power.max(axis=1) <= 0.0)),
     )
 
 

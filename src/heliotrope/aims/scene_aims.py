@@ -8,13 +8,14 @@ of the engine's own flux respects the limit.
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
 from heliotrope.aims.candidates import Candidates, candidates, middles, surface_in
 from heliotrope.aims.errors import Risk, SharedErrors, assess, gains
+from heliotrope.aims.gradient import ascend
 from heliotrope.aims.optimiser import Choice, Step, optimise
 from heliotrope.aims.strategies import Strategy, choose
 from heliotrope.errors import InputError
@@ -155,7 +156,8 @@ def aim_scene(
     demand
         The limit, and the probability with which the limit must hold.
     strategy
-        One of `heliotrope.aims.STRATEGIES`; all but "optimal" ignore the limit.
+        One of `heliotrope.aims.STRATEGIES`. Only "optimal" keeps the limit; "gradient" may exceed
+        it, and the others ignore it.
     start
         Aims of the same mirrors and receiver at another sun, irradiance or limit, or with other
         mirrors in ``dark``: their images are used again, which takes a fraction of the time.
@@ -167,8 +169,8 @@ def aim_scene(
     Raises
     ------
     InputError
-        If there is not exactly one receiver, no mirror reaches the receiver, the limit leaves no
-        room for the errors, or no aims respect the limit with every mirror kept.
+        If there is not exactly one receiver, no mirror reaches the receiver, the limit allows not
+        even one beam with its errors, or no aims respect the limit with every mirror kept.
     """
     rows, columns = surface_in(scene).shape
     limit = demand.limit.on(rows, columns)
@@ -179,6 +181,8 @@ def aim_scene(
     else:
         base = FieldFlux(_posed(scene, start.aims, start.defocused), **light)
         field = _relit(start, base, scene)
+    if strategy == "gradient":
+        return _ascended(base.scene, field, demand, limit, progress, light)
     if strategy != "optimal":
         chosen = choose(field, base.scene, strategy)
         power = float(field.power[np.arange(len(chosen)), chosen].sum())
@@ -261,7 +265,11 @@ def _held(
         more = new if k < FREE else more + BEYOND * np.maximum(new - more, 0.0)
     assert best is not None
     if best.excess > HOLDS:
-        _refuse(scene, best, demand)
+        advice = "let heliostats be defocused" if demand.keep else "ask for a lower probability"
+        what = "no aims were found that respect the flux limit"
+        _refuse(scene, best, demand, what, f", or {advice}")
+    if (best.choice.choice < 0).all():
+        return _one_beam(scene, field, demand, limit, light)
     return best
 
 
@@ -315,13 +323,46 @@ def _evaluated(
     off = choice.choice < 0
     aims = np.where(off[:, None], middles(scene), field.aims[rows, np.maximum(choice.choice, 0)])
     engine = FieldFlux(_posed(scene, aims, off), **light)
-    mirrors = engine.scene.mirrors
-    risk = Risk(np.zeros_like(limit), 0.0, np.zeros_like(limit))
-    if mirrors.pointing.any() or demand.shared.any:
-        groups = np.zeros(len(rows), dtype=np.int64) if demand.groups is None else demand.groups
-        modes = demand.shared.modes(mirrors, scene.sun, demand.pole)
-        width = float(np.median(field.width)) / np.sqrt(field.images.area)
-        risk = assess(engine, modes, groups, demand.probability, limit, width)
+    risk = _risk(engine, field, demand, limit)
+    return SceneAims(engine, field, choice, aims, off, limit, risk, light)
+
+
+def _risk(engine: FieldFlux, field: Candidates, demand: Demand, limit: FloatArray) -> Risk:
+    """Return the uncertainty of the flux."""
+    scene, mirrors = engine.scene, engine.scene.mirrors
+    if not (mirrors.pointing.any() or demand.shared.any):
+        return Risk(np.zeros_like(limit), 0.0, np.zeros_like(limit))
+    groups = np.zeros(len(mirrors), dtype=np.int64) if demand.groups is None else demand.groups
+    modes = demand.shared.modes(mirrors, scene.sun, demand.pole)
+    width = float(np.median(field.width)) / np.sqrt(field.images.area)
+    return assess(engine, modes, groups, demand.probability, limit, width)
+
+
+def _ascended(
+    scene: Scene,
+    field: Candidates,
+    demand: Demand,
+    limit: FloatArray,
+    progress: Step | None,
+    light: dict[str, Any],
+) -> SceneAims:
+    """Return the aims of gradient ascent, which begins with the strategy "spread"."""
+    rows, shifts = np.arange(len(field.weight)), field.shifts
+    up = shifts[rows, choose(field, scene, "spread") % shifts.shape[1]]
+    surface = surface_in(scene)
+    start = np.stack([np.zeros(len(up)), up * surface.height / surface.shape[0]], axis=-1)
+
+    def cap_of(engine: FieldFlux) -> FloatArray:
+        above = _risk(engine, field, demand, limit).above
+        return as_float(np.maximum(limit - above, LEAST * limit))
+
+    aims, prices = ascend(scene, cap_of, start, progress, **light)
+    # A choice that starts from these aims starts from the closest candidates.
+    chosen = np.linalg.norm(field.aims - aims[:, None], axis=-1).argmin(axis=1)
+    power = float(field.power[rows, chosen].sum())
+    choice = Choice(chosen, np.ascontiguousarray(prices.T), field.flux(chosen), power, np.nan)
+    engine = FieldFlux(_posed(scene, aims, None), **light)
+    off, risk = np.zeros(len(rows), dtype=np.bool_), _risk(engine, field, demand, limit)
     return SceneAims(engine, field, choice, aims, off, limit, risk, light)
 
 
@@ -330,13 +371,49 @@ def _place(scene: Scene, cell: tuple[int, ...]) -> str:
     return f"row {cell[0]}, column {cell[1]} ({east:.1f}, {north:.1f}, {up:.1f} m)"
 
 
-def _refuse(scene: Scene, trial: SceneAims, demand: Demand) -> None:
+def _refuse(scene: Scene, trial: SceneAims, demand: Demand, what: str, advice: str) -> NoReturn:
+    """Raise InputError: where the limit is exceeded most, by how much, and what would hold."""
     over = trial.quantile / trial.limit
     cell = tuple(int(n) for n in np.unravel_index(over.argmax(), over.shape))
-    advice = "let heliostats be defocused" if demand.keep else "ask for a lower probability"
+    enough = trial.quantile[cell] / (1.0 - demand.limit.margin)
     raise InputError(
-        f"receiver {surface_in(scene).name}: no aims were found that respect the flux limit; "
-        f"{_place(scene, cell)} gets {1e-3 * trial.quantile[cell]:.4g} kW/m², of which errors are "
-        f"{1e-3 * trial.risk.above[cell]:.4g}, {100 * trial.excess:.2g} % above its "
-        f"{1e-3 * trial.limit[cell]:.4g}; raise the limit by that, or {advice}"
+        f"receiver {surface_in(scene).name}: {what}; {_place(scene, cell)} gets "
+        f"{1e-3 * trial.quantile[cell]:.4g} kW/m², of which errors are "
+        f"{1e-3 * trial.risk.above[cell]:.4g}, {_percent(trial.excess)} above its "
+        f"{1e-3 * trial.limit[cell]:.4g}; raise the limit there to {1e-3 * enough:.4g} kW/m²"
+        f"{advice}"
     )
+
+
+def _percent(excess: float) -> str:
+    return f"{100 * excess:.0f} %" if excess >= 0.1 else f"{100 * excess:.2g} %"
+
+
+def _one_beam(
+    scene: Scene, field: Candidates, demand: Demand, limit: FloatArray, light: dict[str, Any]
+) -> SceneAims:
+    """Return the aims with only the beam that has the lowest peak.
+
+    Raises
+    ------
+    InputError
+        If the limit does not allow even this beam.
+    """
+    images, heights = field.images, field.shifts.shape[1]
+    ends = images.begin + images.box[:, 1] * images.box[:, 3]
+    peaks = [images.values[a:b].max(initial=0.0) for a, b in zip(images.begin, ends, strict=True)]
+    peak = np.repeat(np.reshape(peaks, (-1, images.looks)), heights, axis=1)
+    peak = peak * field.weight[:, None]
+    # A beam that mostly misses the receiver is no use.
+    full = (field.power > 0.0) & (field.power >= 0.5 * field.power.max(axis=1, keepdims=True))
+    row, aim = np.unravel_index(np.where(full, peak, np.inf).argmin(), peak.shape)
+    chosen = np.full(len(peak), -1)
+    chosen[row] = aim
+    none = np.zeros(images.shape[::-1])
+    power = float(field.power[row, aim])
+    choice = Choice(chosen, none, field.flux(chosen), power, np.nan)
+    trial = _evaluated(scene, field, choice, demand, limit, light)
+    if trial.excess > HOLDS:
+        what = "the flux limit does not allow even the beam with the lowest peak"
+        _refuse(scene, trial, demand, what, "")
+    return trial

@@ -13,9 +13,9 @@ from heliotrope.optics.surfaces import Plate
 
 #: Beams of "spread" and "image-size" stay this many standard deviations within the edge.
 INSIDE = 2.0
-Strategy = Literal["middle", "spread", "image-size", "optimal"]
+Strategy = Literal["middle", "spread", "image-size", "gradient", "optimal"]
 #: Names, in the order of a comparison.
-STRATEGIES: tuple[Strategy, ...] = ("middle", "spread", "image-size", "optimal")
+STRATEGIES: tuple[Strategy, ...] = ("middle", "spread", "image-size", "gradient", "optimal")
 
 
 def choose(field: Candidates, scene: Scene, strategy: Strategy) -> IntArray:

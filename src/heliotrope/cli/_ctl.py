@@ -293,6 +293,9 @@ def aims(context: typer.Context, as_json: Json = False) -> None:
         f"{answer['aimed']} heliostats have an aim, {answer['resting']} are off the receiver "
         f"because of the limit, {answer['left']} still have to move"
     )
+    if answer["unlit"]:
+        names = answer["unlit"]
+        print(f"{len(names)} reach no cell of the receiver: {', '.join(names[:10])}")
     if answer["moved"]:
         names = answer["moved"]
         print(f"{len(names)} moved {answer['moved_ago']:.0f} s ago: {', '.join(names[:10])}")

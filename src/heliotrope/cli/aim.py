@@ -69,10 +69,8 @@ def aim(
         typer.Option(min=0.5, max=0.9999, help="Probability that the limit holds in all cells."),
     ] = 0.99,
     strategy: Annotated[
-        Literal["optimal", "middle", "spread", "image-size", "all"],
-        typer.Option(
-            help="The strategies other than optimal are for comparison and ignore the limit."
-        ),
+        Literal["optimal", "middle", "spread", "image-size", "gradient", "all"],
+        typer.Option(help="Only optimal keeps the limit; the others are for comparison."),
     ] = "optimal",
     keep_all: Annotated[
         bool, typer.Option("--keep-all", help="Fail rather than defocus a heliostat.")
@@ -267,6 +265,13 @@ def _print(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> None:
     print_table(
         header, rows, title=f"{chosen.light.plant}: aims on {chosen.light.maps[0].receiver}"
     )
+    if chosen.elsewhere.any():
+        print(f"{int(chosen.elsewhere.sum()):,} heliostats belong to other receivers")
+    if chosen.unlit.any():
+        first = chosen.names[int(chosen.unlit.argmax())]
+        print(
+            f"{int(chosen.unlit.sum()):,} heliostats reach no cell of the receiver, {first} first"
+        )
     binding = int(chosen.scene.binding.sum())
     print(f"{binding:,} of {chosen.limit.size:,} cells at the limit")
     best = np.argsort(-chosen.gain)[:NAMED]

@@ -96,7 +96,8 @@ def read_limit(path: str | Path, margin: float = 0.0) -> FluxLimit:
     Raises
     ------
     FormatError
-        If the file is not a table of numbers, or its lines differ in length.
+        If the file is not a table of numbers, a number is out of range, or its lines differ in
+        length.
     """
     rows: list[list[float]] = []
     for number, line in enumerate(read_text(path, "a flux limit").splitlines(), start=1):
@@ -110,6 +111,15 @@ def read_limit(path: str | Path, margin: float = 0.0) -> FluxLimit:
                 path, "a flux limit is a table of numbers in W/m², without a header",
                 where=f"line {number}",
             ) from None  # fmt: skip
+        wrong = [k for k, x in enumerate(rows[-1], start=1) if not 0.0 < x <= _MOST]
+        if wrong:
+            raise FormatError(
+                path, (
+                    f"the flux must be above 0 and at most {_MOST:g} W/m², not "
+                    f"{rows[-1][wrong[0] - 1]:g} W/m²"
+                ),
+                where=f"line {number}, column {wrong[0]}",
+            )  # fmt: skip
         if len(rows[-1]) != len(rows[0]):
             raise FormatError(
                 path, (

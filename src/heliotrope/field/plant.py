@@ -112,7 +112,8 @@ class Plant(Value, Framed):
         if self.aims.limit is not None and len(self.receivers) != 1:
             raise InputError(
                 f'aims: strategy "limit" needs one receiver, and the plant has '
-                f"{len(self.receivers)}; leave [aims] out"
+                f"{len(self.receivers)}; leave [aims] out, and choose aims with heliotrope aim "
+                "for one receiver at a time"
             )
         if self.aims.limit is not None and self.receivers[0].mesh is not None:
             raise InputError(

@@ -184,8 +184,8 @@ def spread_cells(first, last, rows, mirrors, sun, light, slopes, pointing, sums,
             du, dv = scatter[i, 0] * u + scatter[i, 1] * v, scatter[i, 2] * v
             own[k] += du * du + dv * dv
             value[i] += (du * du + dv * dv) * worth[k]
-            slope[i, 0] += u * cells[k, 6]
-            slope[i, 1] += v * cells[k, 6]
+            slope[i, 0] += u * cells[k, 6] * worth[k]
+            slope[i, 1] += v * cells[k, 6] * worth[k]
             for m in range(modes.shape[1]):
                 shared[m, k] += modes[i, m, 0] * u + modes[i, m, 1] * v
 

@@ -166,8 +166,8 @@ def spread(first, last, rows, mirrors, sun, light, slopes, pointing, sums, parts
     rad. ``modes`` (H, M, 2): displacement of each beam by M shared errors, rad. ``own`` (rows,
     columns) gets variances, (W/m²)²; ``shared`` (M, rows, columns) receives changes of flux, W/m²;
     ``value`` (H,) receives, for each mirror, the sum over cells of its own variance times ``worth``
-    (rows, columns). ``slope`` (H, 2) receives the derivative of each mirror's power with respect to
-    its beam's displacement, W/rad.
+    (rows, columns). ``slope`` (H, 2) receives the derivative of each mirror's power, with each cell
+    weighted by its ``worth``, with respect to its beam's displacement, W/rad.
     """
     weights, variances = sums
     low, step, number, area = grid
@@ -236,8 +236,8 @@ def _take(gradient, begin, end, facing, visible, scatter, modes, worth, own, sha
         for k in range(visible):
             gu, gv, column = gradient[0, r, k], gradient[1, r, k], int(facing[0, k])
             gradient[0, r, k] = gradient[1, r, k] = 0.0
-            slope[0] += gu
-            slope[1] += gv
+            slope[0] += gu * worth[r, column]
+            slope[1] += gv * worth[r, column]
             one, two = scatter[0] * gu + scatter[1] * gv, scatter[2] * gv
             square = one * one + two * two
             own[r, column] += square

@@ -288,13 +288,19 @@ class FieldFlux:
         errors = (as_float(scatter), as_input(modes), as_input(worth))
         return self._plans[0].spread(self._field(), errors, groups)[:3]
 
-    def power_slope(self) -> FloatArray:
+    def power_slope(self, worth: FloatArray | None = None) -> FloatArray:
         """Return how a displacement of each mirror's beam changes its power on the first surface.
 
         The result is the derivative with respect to a displacement to the right and up, as seen
-        from the mirror, W/rad, (H, 2). The power of a cavity is the power into its aperture.
+        from the mirror, W/rad, (H, 2).
+
+        Parameters
+        ----------
+        worth
+            Weight of the power in each cell, in the shape of the cells. None: 1 in every cell; the
+            power of a cavity is then the power into its aperture.
         """
-        return self._plans[0].power_slope(self._field())
+        return self._plans[0].power_slope(self._field(), worth)
 
     def on(self, surface: int) -> "FieldFlux":
         """Return the same flux with one of the surfaces as the first and only surface."""
@@ -439,10 +445,10 @@ class _Grid:
         cells = (self._grid[2], len(self._columns[0]))
         return _spread(look_kernels.spread, (*field, *given), cells, errors, groups)
 
-    def power_slope(self, field: Any) -> FloatArray:
+    def power_slope(self, field: Any, worth: FloatArray | None = None) -> FloatArray:
         """See `FieldFlux.power_slope`."""
-        errors, groups = _no_errors(len(field[0]), (self._grid[2], len(self._columns[0])))
-        return self.spread(field, errors, groups)[3]
+        weight = np.ones((self._grid[2], len(self._columns[0]))) if worth is None else worth
+        return self.spread(field, *_no_errors(len(field[0]), weight))[3]
 
 
 class _Cells:
@@ -490,12 +496,12 @@ class _Cells:
         cells = (len(self._cells),)
         return _spread(cell_kernels.spread_cells, (*field, *given), cells, errors, groups)
 
-    def power_slope(self, field: Any) -> FloatArray:
+    def power_slope(self, field: Any, worth: FloatArray | None = None) -> FloatArray:
         """See `FieldFlux.power_slope`."""
-        if self._front is not None:
+        if self._front is not None and worth is None:
             return self._front.power_slope(field)
-        errors, groups = _no_errors(len(field[0]), (len(self._cells),))
-        return self.spread(field, errors, groups)[3]
+        weight = np.ones(len(self._cells)) if worth is None else worth
+        return self.spread(field, *_no_errors(len(field[0]), weight))[3]
 
 
 def _spread(
@@ -529,10 +535,10 @@ def _spread(
     return as_float(own.sum(axis=0)), shared, value, slope
 
 
-def _no_errors(count: int, cells: tuple[int, ...]) -> tuple[tuple[FloatArray, ...], IntArray]:
-    """Return errors of 0 for a number of mirrors and for all cells, and blocks of mirrors."""
+def _no_errors(count: int, worth: FloatArray) -> tuple[tuple[FloatArray, ...], IntArray]:
+    """Return errors of 0 for a number of mirrors, with a weight of cells, and blocks of mirrors."""
     # Read-only as those of `FieldFlux.spread`, so that the kernels are compiled once.
-    none = (np.zeros((count, 2, 2)), as_input(np.zeros((count, 0, 2))), as_input(np.zeros(cells)))
+    none = (np.zeros((count, 2, 2)), as_input(np.zeros((count, 0, 2))), as_input(worth))
     return none, np.arange(count) * _BLOCKS // count
 
 

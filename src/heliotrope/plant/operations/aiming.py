@@ -103,6 +103,8 @@ class AimsView:
     aimed, resting, left
         Number of heliostats with an aim; number of wanted heliostats that the limit keeps at
         standby; number of heliostats that still have to move.
+    unlit
+        Heliostats that send no light to any cell of the receiver, wherever they aim.
     moved, moved_ago
         Number of heliostats in the last move, and time since that move, s.
     problem
@@ -122,6 +124,7 @@ class AimsView:
     aimed: int = 0
     resting: int = 0
     left: int = 0
+    unlit: tuple[str, ...] = ()
     moved: tuple[str, ...] = ()
     moved_ago: float = math.inf
     problem: str = ""
@@ -233,7 +236,7 @@ class Aiming:
             made, at=now - self._good_at, limit=float(answer.limit.min()),
             peak=float((answer.flux + answer.above).max()), reserve=-answer.excess,
             binding=answer.binding, power=answer.power, planned=answer.planned, gap=answer.gap,
-            left=answer.left,
+            left=answer.left, unlit=tuple(self._plant.field.names[row] for row in answer.unlit),
         )  # fmt: skip
 
     # -- running ---------------------------------------------------------------------------
@@ -280,14 +283,7 @@ class Aiming:
         except Exception as error:  # noqa: BLE001 - the plant goes on whatever fails here
             await self._failed(f"{type(error).__name__}: {error}")
         else:
-            self._round_at = now
-            if answer.planned <= 0.0 and self._movers(now).any():
-                least = 1e-3 * float(answer.limit.min())
-                await self._failed(
-                    f"the limit, {least:.4g} kW/m² less the margin, allows not even one beam"
-                )
-                return
-            self._good_at = now
+            self._round_at = self._good_at = now
             hot = self._measure(answer, present)
             self._take(answer, present)
             if hot:

@@ -14,6 +14,7 @@ import numpy as np
 
 from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray, as_float
+from heliotrope.lcu import states
 from heliotrope.optics import (
     FieldFlux,
     FieldOptics,
@@ -36,6 +37,9 @@ from heliotrope.plant.workers import Worker
 
 #: Time for which a prediction is shown, and longest wait for the next prediction, s.
 EVERY, PATIENCE = 5.0, 5.0
+#: Time after the start during which the flux counts as unknown, s, as long as more than this share
+#: of the heliostats have not reported where they are.
+FIRST, FEW = 60.0, 0.02
 #: Largest fraction of the power from beams with large errors for which a cell has an uncertainty.
 WIDE = 0.02
 _LIGHT = FieldOptics()
@@ -69,7 +73,7 @@ class PredictedFlux:
         self._rows = np.array([place[name] for name in plant.field.names], dtype=np.intp)
         self._surfaces = tuple(surface_of(receiver) for receiver in design.receivers)
         self._views: dict[str, PredictedView] = {}
-        self._made_at = -np.inf
+        self._made_at, self._begun = -np.inf, plant.now()
         self._computing: asyncio.Task[None] | None = None
 
     async def everywhere(self) -> dict[str, PredictedView]:
@@ -80,8 +84,14 @@ class PredictedFlux:
         Raises
         ------
         RefusedError
-            If nothing has been computed yet since the start, or the computation failed.
+            If many heliostats have not reported their positions yet since the start, nothing has
+            been computed yet, or the computation failed.
         """
+        if missing := self._unreported():
+            raise RefusedError(
+                f"flux: not yet known; {missing:,} of {len(self._plant.field):,} heliostats have "
+                "not yet reported their positions since the start; ask again in some seconds"
+            )
         running = self._computing
         if running is None and self._plant.now() - self._made_at >= EVERY:
             running = self._computing = asyncio.create_task(self._compute())
@@ -97,6 +107,18 @@ class PredictedFlux:
                 "a minute after an installation, otherwise seconds); ask again"
             )
         return self._views
+
+    def _unreported(self) -> int:
+        """Return the number of heliostats that have not reported since the start; 0 if few.
+
+        A heliostat that tracks must also have reported its step counts.
+        """
+        field, now = self._plant.field, self._plant.now()
+        if now - self._begun > FIRST:
+            return 0
+        uncounted = field.among(states.ON_AIM, now) & ~np.isfinite(field.counted_at)
+        missing = int((uncounted | ~np.isfinite(field.heard)).sum())
+        return missing if missing > FEW * len(field) else 0
 
     async def aclose(self) -> None:
         """Cancel a running computation."""

@@ -1,14 +1,20 @@
-"""The observer of a flux limit: the true flux on the receiver, and the origin of each aim.
+r"""The observer of a flux limit: the true flux on the receiver, and the origin of each aim.
 
 It computes the flux from the true mirrors and the true sun, at the irradiance for which the limit
-must hold. It reads the answers of the plant's optimiser where they leave the plant's worker, and
-the aims of persons where they are given.
+must hold. Where the limit has a ramp of rate r, with rounds every T, the beams on the receiver may
+bring a cell, whenever the sky clears,
+
+$$F_c(t) \le W_c(t - τ) + r (T + τ)$$
+
+where W is the greatest flux that the cell had within a minute before, at the true irradiance, and
+τ = `SUDDEN`. The observer reads the answers of the plant's optimiser where they leave the plant's
+worker, and the aims of persons where they are given.
 """
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from math import inf
-from typing import TypeVar, TypeVarTuple
+from typing import Protocol, TypeVar, TypeVarTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -38,8 +44,22 @@ AT_ONCE, BELOW_WITHIN = 5.0, 60.0
 #: Distance from its aim, m, and time, s, from which a beam is astray: several times the play of the
 #: gears, and longer than the way from standby.
 ASTRAY, TOO_LONG = 0.3, 3.0
+#: Time over which a rise of the flux is judged, s; time for which a cell stays warm, and for which
+#: a heliostat may be under way to an aim that a flux of then allowed, s.
+SUDDEN, WARM, UNDER_WAY = 6.0, 60.0, 30.0
+#: Tolerance of the ramp for the model's own error, as a fraction of the limit.
+RAMP_ERROR = 0.05
 #: Commands by which a person brings light to the receiver.
 LIGHTS = ("TRACK", "REFOCUS", "AIM")
+
+
+class TrueSky(Protocol):
+    """The true direct irradiance, W/m²: without clouds, and at present."""
+
+    clear: float
+
+    def dni(self) -> float:
+        """Return the present irradiance, W/m²."""
 
 
 class FluxObserver(Judge):
@@ -53,10 +73,16 @@ class FluxObserver(Judge):
         All heliostats, in the order of the design.
     design
         The plant, with its flux limit and one receiver.
+    sky
+        The true irradiance.
     """
 
-    def __init__(self, start: float, boards: Sequence[Board], design: Plant) -> None:
+    def __init__(self, start: float, boards: Sequence[Board], design: Plant, sky: TrueSky) -> None:
         super().__init__(start)
+        self._sky = sky
+        #: Times, s, and the flux of the cells in the irradiance of these times, W/m².
+        self._had: list[tuple[float, FloatArray]] = []
+        self._heated_since = inf
         self._boards, self._design = tuple(boards), design
         (self._receiver,) = design.receivers
         self._surface = surface_of(self._receiver)
@@ -132,7 +158,9 @@ class FluxObserver(Judge):
         self._origins(plant, now)
         if now >= self._due:
             self._due = now + EVERY
-            self._hold(float(self.excess(sun).max()), now)
+            flux = self.flux(sun)
+            self._hold(float((flux / self._allowed(flux) - 1.0).max()), now)
+            self._heat(flux, now)
 
     def _strays(self, plant: PlantController, sun: FloatArray) -> bool:
         """Return whether a beam is on the receiver, and not at its aim."""
@@ -158,17 +186,41 @@ class FluxObserver(Judge):
         saw = f"the true flux is {100.0 * excess:.1f} % above the limit, for {passed:.0f} s"
         self.check(FLUX, passed <= limit, now, self._receiver.name, saw)
 
-    def excess(self, sun: FloatArray) -> FloatArray:
-        """Return the ratio of the true flux to the limit, less 1, in each cell, (rows, columns)."""
+    def _heat(self, flux: FloatArray, now: float) -> None:
+        """Check that no cell would be heated faster than the ramp allows if the sky were clear."""
+        aims, since = self._design.aims, now - WARM - UNDER_WAY
+        self._had = [(at, had) for at, had in self._had if at >= since]
+        before = [had for at, had in self._had if at <= now - SUDDEN]
+        self._had.append((now, as_float(flux * self._sky.dni() / aims.dni)))
+        if aims.ramp <= 0.0 or not before:
+            return
+        rise = as_float(flux * self._sky.clear / aims.dni - np.max(before, axis=0))
+        more = rise - aims.ramp * (aims.every + SUDDEN) - RAMP_ERROR * self._allowed(flux)
+        self._heated_since = min(self._heated_since, now) if more.max() > 0.0 else inf
+        passed = now - self._heated_since
+        calm = now - self._disturbed_at > BELOW_WITHIN + SUDDEN
+        if not calm:
+            return
+        saw = (
+            f"{1e-3 * rise.max():.3g} kW/m² more than {SUDDEN:g} s ago would heat a cell when the "
+            f"sky clears, for {passed:.0f} s; the ramp is {0.06 * aims.ramp:.3g} kW/m² a minute"
+        )
+        self.check(FLUX, passed <= AT_ONCE, now, self._receiver.name, saw)
+
+    def _allowed(self, flux: FloatArray) -> FloatArray:
+        """Return the limit without its margin, W/m², (rows, columns)."""
+        limit = self._design.aims.limit
+        assert limit is not None
+        return as_float(limit.on(*flux.shape) / (1.0 - limit.margin))
+
+    def flux(self, sun: FloatArray) -> FloatArray:
+        """Return the true flux at the irradiance of the limit, W/m², (rows, columns)."""
         aims = self._design.aims
-        assert aims.limit is not None
         vertex, normal = (np.stack(vectors) for vectors in zip(*self._poses(), strict=True))
         mirrors = Mirrors.of(vertex, normalize(normal), self._sizes(), np.array(RECEIVER))
         mirrors = shaped(mirrors, self._design)
         dark = np.array([board.miss(sun, RECEIVER) > OFF for board in self._boards])
-        flux = FieldFlux(Scene(sun, aims.dni, mirrors, (self._surface,), dark=dark)).maps[0]
-        allowed = aims.limit.on(*flux.shape) / (1.0 - aims.limit.margin)
-        return as_float(flux / allowed - 1.0)
+        return FieldFlux(Scene(sun, aims.dni, mirrors, (self._surface,), dark=dark)).maps[0]
 
     def _poses(self) -> Sequence[tuple[FloatArray, FloatArray]]:
         return [board.mirror() for board in self._boards]

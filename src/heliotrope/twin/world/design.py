@@ -28,6 +28,8 @@ JOINT = JointSettings(least=3, first=8)
 #: and rounds in which one beam at a time moves.
 LIMIT_OF_PEAK = 0.6
 AIMS = AimSettings(probability=0.95, moves=4.0, together=1, every=15.0)
+#: Rise of the flux that a ramp allows in one round, over the highest peak of a single beam.
+RISE_OF_BEAM = 1.2
 _EYE = "below"
 RECEIVER_VISITS = ReceiverSettings(_EYE, "receiver", least=2, known=0.01, power=0.01, every=60.0)
 
@@ -82,8 +84,10 @@ def design_of(
     )
 
 
-def limited(design: Plant, sun: FloatArray) -> Plant:
+def limited(design: Plant, sun: FloatArray, *, ramp: bool) -> Plant:
     """Return a plant with a flux limit, which all its beams in the receiver's middle would exceed.
+
+    With a ramp, one beam at a time may come to a cell.
 
     Parameters
     ----------
@@ -94,7 +98,12 @@ def limited(design: Plant, sun: FloatArray) -> Plant:
     """
     scene = scene_of(design, sun, design.receivers[0].center, dni=AIMS.dni)
     limit = FluxLimit(LIMIT_OF_PEAK * float(FieldFlux(scene).maps[0].max()), 0.05)
-    return replace(design, aims=replace(AIMS, strategy="limit", limit=limit))
+    rate = 0.0
+    if ramp:
+        others = ~np.eye(len(design), dtype=np.bool_)
+        highest = max(FieldFlux(replace(scene, dark=dark)).maps[0].max() for dark in others)
+        rate = RISE_OF_BEAM * float(highest) / AIMS.every
+    return replace(design, aims=replace(AIMS, strategy="limit", limit=limit, ramp=rate))
 
 
 def wanted_of(fits: Sequence[Outfit]) -> Wanted:

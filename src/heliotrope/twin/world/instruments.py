@@ -1,4 +1,8 @@
-"""Sensors of a simulated plant, which may report false values: wind, and flux on the receiver."""
+"""Instruments of a simulated plant: sensors that may report false values, and the sky.
+
+The sensors show wind and flux on the receiver; a pyrheliometer shows the irradiance under passing
+clouds.
+"""
 
 import math
 import random
@@ -6,6 +10,7 @@ from collections.abc import Callable
 
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.emergency import DNI_READING
 from heliotrope.safety import FLUX_READING
 from heliotrope.twin.invariants.sensors import SensorObserver
 
@@ -13,6 +18,9 @@ from heliotrope.twin.invariants.sensors import SensorObserver
 READINGS = ("wind_gust", "wind_mean", "receiver_flux", FLUX_READING)
 #: Interval between readings, s.
 _EVERY = 1.0
+#: Mean time between two clouds, shortest and longest cloud, s, and the fractions of the irradiance
+#: that they leave.
+_CLEAR, _CLOUD, _LEFT = 100.0, (10.0, 200.0), (0.02, 0.5)
 
 
 class Instruments:
@@ -89,4 +97,51 @@ class Instruments:
                     self._last[name] = value
                     self.plant.put(name, value)
                     self._observer.fed(name, value, self._clock.monotonic())
+            await sleep_until(self._clock, due)
+
+
+class Sky:
+    """The direct irradiance under clouds that cover the whole field, and its pyrheliometer.
+
+    Parameters
+    ----------
+    clock
+        Clock that shows true time.
+    seed
+        Seed of the clouds.
+    seconds
+        Length of the run, s.
+    clear
+        Irradiance without clouds, W/m².
+
+    Attributes
+    ----------
+    plant
+        The plant that receives the readings; None while it does not run.
+    """
+
+    def __init__(self, clock: Clock, seed: int, seconds: float, clear: float) -> None:
+        self.plant: PlantController | None = None
+        self.clear, self._clock = clear, clock
+        chance = random.Random(f"clouds {seed}")
+        self._clouds: list[tuple[float, float, float]] = []
+        at = clock.monotonic()
+        end = at + seconds
+        while (at := at + chance.expovariate(1.0 / _CLEAR)) < end:
+            over = at + chance.uniform(*_CLOUD)
+            self._clouds.append((at, over, chance.uniform(*_LEFT)))
+            at = over
+
+    def dni(self) -> float:
+        """Return the present irradiance, W/m²."""
+        now = self._clock.monotonic()
+        left = [share for begin, end, share in self._clouds if begin <= now < end]
+        return self.clear * min(left, default=1.0)
+
+    async def run(self) -> None:
+        """Send the irradiance to the plant every second, until cancelled."""
+        while True:
+            due = self._clock.monotonic() + _EVERY
+            if self.plant is not None:
+                self.plant.put(DNI_READING, self.dni())
             await sleep_until(self._clock, due)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from heliotrope.errors import InputError
-from heliotrope.geometry import FloatArray
+from heliotrope.geometry import FloatArray, azimuth_elevation
 from heliotrope.lcu import ticks
 from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of
 from heliotrope.links.common_settings import CommonSettings
@@ -28,13 +28,13 @@ from heliotrope.links.tapped import TappedLink
 from heliotrope.mechanism.board_items import Wanted, packed
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant.controller import PlantController, Stores
-from heliotrope.plant.emergency import EmergencyRecord
+from heliotrope.plant.emergency import DNI_READING, EmergencyRecord
 from heliotrope.plant.field.assigned import Assigned
 from heliotrope.plant.field.witnesses import SENSOR_ERROR
 from heliotrope.plant.operations.service import Service
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import FLUX_READING, Alarm, conditions
-from heliotrope.sun import vector
+from heliotrope.sun import clear_sky, vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.clocks import TickCounter
 from heliotrope.twin.boards.outfit import (
@@ -69,7 +69,7 @@ from heliotrope.twin.world.crew import CREW, Crew, CrewAct
 from heliotrope.twin.world.damage import Damage
 from heliotrope.twin.world.design import MIRROR, design_of, limited, wanted_of
 from heliotrope.twin.world.faults import Fault
-from heliotrope.twin.world.instruments import READINGS, Instruments
+from heliotrope.twin.world.instruments import READINGS, Instruments, Sky
 from heliotrope.twin.world.maintenance import Maintenance
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
@@ -80,6 +80,7 @@ from heliotrope.twin.world.tour import TOUR, TOUR_LENGTH, Tour
 from heliotrope.twin.world.twice import SecondPlant
 from heliotrope.twin.world.work import DAY_WORK, LIT_WORK, LOSSES, USUAL_WORK, Work
 from heliotrope.twin.world.worlds import (
+    CLIMBING,
     COARSE,
     COMMON,
     DAYS,
@@ -97,6 +98,7 @@ from heliotrope.twin.world.worlds import (
     knows_boards,
     measured,
     motors_of,
+    ramped,
     stored_by,
     surveyed,
     works,
@@ -189,7 +191,9 @@ class RunPlan:
     @property
     def size(self) -> int:
         """Number of heliostats, large enough for joint visits or a flux limit if there are any."""
-        least = PARTY if joint_visits(self.worlds) else LIMITED if LIMIT in self.worlds else 1
+        least = PARTY if joint_visits(self.worlds) else 1
+        if LIMIT in self.worlds:
+            least = max(least, CLIMBING if ramped(self.seed) else LIMITED)
         return max(self.heliostats, least)
 
     @property
@@ -323,8 +327,12 @@ class Simulation:
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
         together = joint_visits(plan.worlds)
         self._design, self._homes = design_of(known, homes, scene, together=together), homes
+        self._sky: Sky | None = None
         if LIMIT in plan.worlds:
-            self._design = limited(self._design, self.sun(self.begin))
+            sun = self.sun(self.begin)
+            self._design = limited(self._design, sun, ramp=ramped(plan.seed))
+            clear = clear_sky(float(azimuth_elevation(sun)[1]), scene.site.height)
+            self._sky = Sky(self._clock, plan.seed, plan.seconds, clear)
         # The boards' desired items and assigned points survive the plant's program.
         self._fits = known
         self._wanted = wanted_of(known) if knows_boards(plan.worlds) else Wanted()
@@ -423,8 +431,8 @@ class Simulation:
         kind = DAY_WORK if DAYS in plan.worlds else LIT_WORK if lights else USUAL_WORK
         kind = replace(kind, together=together, lowest=self._scene.lowest)
         flux = None
-        if LIMIT in plan.worlds:
-            flux = FluxObserver(self.begin, self.boards, self._design)
+        if self._sky is not None:
+            flux = FluxObserver(self.begin, self.boards, self._design, self._sky)
         work = Work(plan.seed, sight, self._exits, kind, flux)
         watch = replace(self._new_watch(work, together=together), flux=flux)
         truth = {name: board.outfit.causes for name, board in boards.items()}
@@ -541,6 +549,8 @@ class Simulation:
         plant = self.plant = self._begins(links, stores, self._chance.randbytes, self._settings())
         self.operator.begins(plant)
         self.instruments.plant = plant
+        if self._sky is not None:
+            self._sky.plant = plant
         parts = [*(link.run() for link in links.values()), plant.run()]
         if self._store is not None:
             parts.append(self._parks(self._store.service(plant, self._alarmed), self._store))
@@ -585,6 +595,8 @@ class Simulation:
     def _settings(self) -> PlantSettings:
         """Return the settings of the plant."""
         settings = MEASURED if self._measured else SETTINGS
+        if self._sky is not None:
+            settings = replace(settings, sensors=settings.sensors | {DNI_READING})
         return replace(settings, witnesses=WITNESSES) if COMMON in self.plan.worlds else settings
 
     async def _parks(self, service: Service, store: PlantStore) -> None:
@@ -677,6 +689,8 @@ class Simulation:
         if self._maintenance is not None:
             self._maintenance.service = None
         self.instruments.plant = None
+        if self._sky is not None:
+            self._sky.plant = None
         for each in self._judges:
             each.on_end(now)
         for pod in self.pods:
@@ -723,6 +737,8 @@ class Simulation:
                 tasks += [self._second.operator.keep(), self._second.work()]
             if self._measured:
                 tasks.append(self.instruments.run())
+            if self._sky is not None:
+                tasks.append(self._sky.run())
             others = [group.create_task(work) for work in tasks]
             try:
                 await self._turn(damage, group)

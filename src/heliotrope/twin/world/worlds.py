@@ -32,7 +32,7 @@ WORLDS = {
     "parties": "as visits, by the plant's own schedule: many at once on a target and the receiver",
     "repairs": "boards, files and stores are exchanged for wrong ones, drives stall, persons lock",
     "common": "plant and clusters begin with the same wrong time, which a sun sensor contradicts",
-    "limit": "automatic control aims under a flux limit, without calibration targets",
+    "limit": "automatic control aims under a flux limit, and often a ramp, while clouds pass",
     "days": "as parties, from morning to evening stow: several persons act at any stage of a visit",
 }
 #: A short working day, and its length, s.
@@ -41,10 +41,13 @@ DAYS, DAY = "days", 840.0
 REPAIRS, COMMON = "repairs", "common"
 #: Worlds in which only their own faults occur.
 OWN_FAULTS = frozenset({DAYS, REPAIRS})
-#: Automatic control under a flux limit, and its minimum number of heliostats.
-LIMIT, LIMITED = "limit", 4
+#: Automatic control under a flux limit, and its minimum numbers of heliostats: without and with a
+#: ramp, along which single beams must be small steps.
+LIMIT, LIMITED, CLIMBING = "limit", 4, 8
 #: Worlds with automatic control.
 WORKING = ("visits", "day", "lights", "parties", LIMIT, DAYS)
+#: Fraction of these runs whose receiver may be heated only along a ramp.
+_RAMPED = 0.5
 #: Worlds with joint visits and receiver visits, and their minimum number of heliostats.
 PARTIES, PARTY = ("parties", DAYS), 6
 #: Worlds in which site, date, hour, and places are drawn.
@@ -73,7 +76,8 @@ COARSE = Stepping((32, 32))
 _COARSE_DAYS, _UNSURVEYED, _BESIDE = 1.0 / 3.0, 1.0 / 3.0, (0.018, 0.022)
 #: Fraction of the days on which a mirror is covered, so that it reflects no light.
 _COVERED = 0.25
-#: Fraction of the runs of `mixed` that are only a working day; the same for repairs.
+#: Fraction of the runs of `mixed` that are only a working day; about the same for repairs, and for
+#: a flux limit.
 ALONE_SHARE = 0.1
 
 
@@ -95,7 +99,7 @@ def mixed(seed: int) -> tuple[str, ...]:
 
     These are some of `MIX`, rarely with a world of `RARE`, or a single world.
     """
-    for alone in (DAYS, REPAIRS):
+    for alone in (DAYS, REPAIRS, LIMIT):
         if random.Random(f"{alone} {seed}").random() < ALONE_SHARE:
             return (alone,)
     chance = random.Random(f"worlds {seed}")
@@ -181,6 +185,11 @@ def pause_of(worlds: Sequence[str], seed: int, pause: float) -> float:
 def works(worlds: Sequence[str]) -> bool:
     """Return whether automatic control works in a run."""
     return not set(worlds).isdisjoint(WORKING)
+
+
+def ramped(seed: int) -> bool:
+    """Return whether the flux limit of a run has a ramp."""
+    return random.Random(f"ramp {seed}").random() < _RAMPED
 
 
 def joint_visits(worlds: Sequence[str]) -> bool:
