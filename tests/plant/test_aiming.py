@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from heliotrope.aims.heating import Heating
 from heliotrope.aims.rounds import forget
 from heliotrope.errors import InputError
 from heliotrope.field.aim_settings import AimSettings
@@ -342,6 +343,23 @@ def test_the_receiver_is_heated_in_steps_at_the_start_and_after_a_cloud() -> Non
             back = await watched(120.0)
             assert np.diff([cloud[-1], *back]).max() <= 1.3 * ramp
             assert back[-1] > 0.9 * up[-1]
+
+    played(scene, sensors=(DNI_READING,), ramp=ramp / every)
+
+
+def test_a_restart_in_full_sun_takes_no_beam_from_a_warm_receiver() -> None:
+    ramp, every = 30e3, 15.0
+
+    async def scene(made: LivePlant) -> None:
+        sky = Sky(made)
+        async with sky.shining():
+            await asyncio.sleep(130.0)
+            before = await greatest(made, every)
+            assert before > 1.5 * ramp
+            # What the program has kept in memory only.
+            made.operations._aiming._heating = Heating(ramp / every, every)
+            after = [await greatest(made, every) for _ in range(4)]
+            assert min(after) > 0.9 * before, after
 
     played(scene, sensors=(DNI_READING,), ramp=ramp / every)
 

@@ -35,6 +35,11 @@ class Heating:
         self._had: list[tuple[float, FloatArray]] = []
         self._line: tuple[float, FloatArray] | None = None
 
+    @property
+    def known(self) -> bool:
+        """Whether any flux of the cells has been noted."""
+        return bool(self._had)
+
     def note(self, at: float, flux: FloatArray) -> None:
         """Note the flux of the cells at a time, s, W/m², in the irradiance of that time."""
         self._had = [(then, had) for then, had in self._had if at - then <= WARM]

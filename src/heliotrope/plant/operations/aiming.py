@@ -284,11 +284,13 @@ class Aiming:
             await self._failed(f"{type(error).__name__}: {error}")
         else:
             self._round_at = self._good_at = now
+            # A program that starts while beams are on the receiver must first see how hot it is.
+            blind = self._heating is not None and not self._heating.known and present.shining.any()
             hot = self._measure(answer, present)
             self._take(answer, present)
             if hot:
                 await self._step(self._plant.now())
-            else:
+            elif not blind:
                 await self._go(answer.moves)
 
     def _measure(self, answer: Answer, present: Round) -> bool:
