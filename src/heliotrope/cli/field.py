@@ -9,8 +9,9 @@ from heliotrope.cli._common import print_json, print_table
 
 #: Sun positions for `defocus`: azimuth from noon, and elevation, degrees.
 _SUNS = ((0.0, 65.0), (0.0, 40.0), (90.0, 30.0), (-70.0, 20.0))
-#: Distance from the receiver up to which beams are followed there, m.
-_AROUND = 100.0
+#: Distance from the receiver up to which light is sought, m, and the light whose extent is printed,
+#: suns.
+_AROUND, _BRIGHT = 200.0, 10.0
 
 app = typer.Typer(help="Create and check plant files.", no_args_is_help=True)
 
@@ -113,7 +114,7 @@ def defocus(
     from heliotrope.errors import InputError
     from heliotrope.field.formats import plant_file
     from heliotrope.geometry import direction
-    from heliotrope.optics.standing import hottest
+    from heliotrope.optics.standing import hottest, reach_of
     from heliotrope.plant.field.aims import BeamCheck, default_aims
     from heliotrope.plant.motion.defocusing import defocused_field
 
@@ -133,9 +134,11 @@ def defocus(
         row: dict[str, float] = {"azimuth_deg": azimuth % 360.0, "elevation_deg": elevation}
         for name, alike in (("same", True), ("spread", False)):
             angles = defocused_field(check, aims, sun, alike=alike)
-            hot = hottest(check.together(angles, sun), center, _AROUND)
+            beams = check.together(angles, sun)
+            hot = hottest(beams, center, _AROUND)
             away = float(np.linalg.norm(hot.point - center))
-            row |= {f"{name}_suns": hot.suns, f"{name}_m": away, f"{name}_reach_m": hot.reach}
+            row |= {f"{name}_suns": hot.suns, f"{name}_m": away, f"{name}_bound_suns": hot.bound}
+            row[f"{name}_reach_m"] = reach_of(beams, center, _AROUND, _BRIGHT)
         documents.append(row)
     if as_json:
         print_json(documents)
