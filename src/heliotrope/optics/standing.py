@@ -42,13 +42,38 @@ def suns_of_the_year(latitude: float) -> FloatArray:
         Latitude, rad, north positive.
     """
     declination = np.arange(-_TROPIC, _TROPIC + _STEP, _STEP)
-    hour = np.arange(-np.pi, np.pi, _STEP)
+    suns = _suns_at(latitude, declination, np.arange(-np.pi, np.pi, _STEP))
+    return as_float(suns[suns[:, 2] > -_REFRACTION])
+
+
+def hours_of_the_year(
+    latitude: float, days: int = 24, every: float = 0.5
+) -> tuple[FloatArray, FloatArray]:
+    """Return sun positions of the year, (S, 3), and the daylight hours each stands for, (S,).
+
+    Parameters
+    ----------
+    latitude
+        Latitude, rad, north positive.
+    days
+        Number of days, evenly spaced over the year.
+    every
+        Time between sun positions of a day, h.
+    """
+    turn = 2.0 * np.pi * (np.arange(days) + 0.5) / days
+    hour = np.arange(-12.0 + 0.5 * every, 12.0, every) * np.pi / 12.0
+    suns = _suns_at(latitude, np.arcsin(np.sin(_TROPIC) * np.sin(turn)), hour)
+    suns = as_float(suns[suns[:, 2] > 0.0])
+    return suns, np.full(len(suns), 365.25 / days * every)
+
+
+def _suns_at(latitude: float, declination: FloatArray, hour: FloatArray) -> FloatArray:
+    """Return unit vectors, ENU, (D · H, 3), at declinations (D,) and hour angles (H,), rad."""
     d, h = (angle.ravel() for angle in np.meshgrid(declination, hour))
     polar, equal = np.sin(d), np.cos(d) * np.cos(h)
     sine, cosine = np.sin(latitude), np.cos(latitude)
     north, up = cosine * polar - sine * equal, sine * polar + cosine * equal
-    suns = np.stack([-np.cos(d) * np.sin(h), north, up], axis=-1)
-    return as_float(suns[up > -_REFRACTION])
+    return as_float(np.stack([-np.cos(d) * np.sin(h), north, up], axis=-1))
 
 
 def entered_over_the_year(

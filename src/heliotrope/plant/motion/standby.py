@@ -18,7 +18,8 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, as_float
-from heliotrope.optics.beam import Beams
+from heliotrope.optics.beam import NOMINAL_DNI, Beams
+from heliotrope.optics.glare import Hazard, glare_at
 from heliotrope.optics.standing import Hottest, hottest, stays_below
 from heliotrope.plant.field.aims import BeamCheck, default_aims, point_text
 from heliotrope.plant.motion.paths import Paths
@@ -63,6 +64,28 @@ class Rest:
     moves: FloatArray
     returns: FloatArray
     blocked: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class EyeYear:
+    """A year of glare at a place, with the whole field at standby under a clear sky.
+
+    Attributes
+    ----------
+    hours
+        Daylight hours per year of each `Hazard`, (3,).
+    suns
+        Irradiance at the worst sun position, as a multiple of the direct sun.
+    hazard
+        Worst hazard in the year.
+    sun
+        Sun position with the strongest light, unit vector, (3,).
+    """
+
+    hours: FloatArray
+    suns: float
+    hazard: Hazard
+    sun: FloatArray
 
 
 class StandbyField:
@@ -119,7 +142,7 @@ class StandbyField:
             points,
             tuple(hottest(self._beams(points, s), self.center, self._around) for s in self.suns),
             moves,
-            np.array([_returned(row) for row in moves]),
+            self._returns(moves),
             tuple(len(self._blocked(self._rows, points, sun)) for sun in self.suns),
         )
 
@@ -140,7 +163,8 @@ class StandbyField:
         InputError
             If no spread keeps the limit and the return, or a heliostat has no clear point.
         """
-        side, size = self._side(), self._largest(self._side())
+        side = self._side()
+        size = self._largest(side)
         low, best, tried = 0.0, self._points(side, size), 0
         if not self._keeps(best, limit):
             raise self._too_low(best, limit, size)
@@ -158,8 +182,43 @@ class StandbyField:
         self._check_eyes(best)
         return best
 
+    def glare(
+        self,
+        points: FloatArray,
+        eyes: FloatArray,
+        hours: FloatArray,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> list[EyeYear]:
+        """Return the glare at eyes (P, 3) over sun positions, each weighted by hours (S,).
+
+        The eyes look at the heliostats. The direct sun is 1000 W/m² at all hours, which errs on
+        the safe side.
+        """
+        shape = (len(self.suns), len(eyes))
+        hazard, light = np.zeros(shape, dtype=np.int8), np.zeros(shape)
+        for k, sun in enumerate(self.suns):
+            found = glare_at(self._beams(points, sun), eyes)
+            hazard[k], light[k] = found.hazard, found.corneal / NOMINAL_DNI
+            if progress is not None:
+                progress(k + 1, len(self.suns))
+        years = []
+        for p in range(len(eyes)):
+            spent = np.bincount(hazard[:, p], hours, minlength=len(Hazard))
+            worst = int(light[:, p].argmax())
+            most = Hazard(int(hazard[:, p].max()))
+            years.append(EyeYear(as_float(spent), float(light[worst, p]), most, self.suns[worst]))
+        return years
+
+    def _back_in_time(self, points: FloatArray) -> bool:
+        today, back = (self._returns(self._moves(some)) for some in (self.today, points))
+        return bool((back <= LONGEST_RETURN * today).all())
+
+    @staticmethod
+    def _returns(moves: FloatArray) -> FloatArray:
+        return np.array([_returned(row) for row in moves])
+
     def _keeps(self, points: FloatArray, limit: float) -> bool:
-        return all(
+        return self._back_in_time(points) and all(
             stays_below(self._beams(points, sun), self.center, self._around, limit)
             for sun in self.suns
         )
@@ -168,7 +227,7 @@ class StandbyField:
         return self.check.together(self.check.poses(self._rows, points, sun).best_angles, sun)
 
     def _points(self, side: float, size: float) -> FloatArray:
-        """Return points in a sector that is ``size`` m wide; none lights a receiver or a target."""
+        """Return points in a sector ``size`` m wide, whose beams enter no receiver or target."""
         slant = np.linalg.norm(self._vertex - self.center, axis=-1)
         place = np.empty(len(slant), dtype=np.intp)
         place[np.argsort(slant, kind="stable")] = np.arange(len(slant))
@@ -196,7 +255,7 @@ class StandbyField:
         return float(np.median(np.linalg.norm(self.today - self.center, axis=-1)))
 
     def _sector(self, rows: Rows, place: Rows, side: float, size: float) -> FloatArray:
-        """Return the points of heliostats (K,) with numbers in the sequence (K,), ENU, m, (K, 3)."""
+        """Return points (K, 3), ENU, m, of heliostats (K,) with numbers in the sequence (K,)."""
         sight = (self.center - self._vertex[rows]) * (1.0, 1.0, 0.0)
         level = np.linalg.norm(sight, axis=-1, keepdims=True)
         sight = np.where(level > 1e-3, sight / np.maximum(level, 1e-3), (0.0, 1.0, 0.0))
@@ -233,13 +292,9 @@ class StandbyField:
         """Return the largest spread that keeps the height and the return, m."""
         height = float(self.center[2] - self._vertex[:, 2].max())
         size = max(_FARTHEST * height - self._inner, 1.0)
-        today = np.array([_returned(row) for row in self._moves(self.today)])
-        while True:
-            points = self._sector(self._rows, self._rows, side, size)
-            back = np.array([_returned(row) for row in self._moves(points)])
-            if (back <= LONGEST_RETURN * today).all() or size < 1.0:
-                return size
+        while size > 1.0 and not self._back_in_time(self._points(side, size)):
             size *= 0.9
+        return size
 
     def _too_low(self, points: FloatArray, limit: float, size: float) -> InputError:
         lights = [hottest(self._beams(points, sun), self.center, self._around) for sun in self.suns]
