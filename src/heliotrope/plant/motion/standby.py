@@ -34,8 +34,9 @@ _R2 = 1.324717957244746
 #: Number of points tried for a heliostat, and maximum distance of points from the receiver as a
 #: fraction of the receiver's height above the mirrors.
 _TRIES, _FARTHEST = 40, 1.5
-#: Precision of the size of the spread, relative; number of heliostats whose paths decide the side.
-_PRECISION, _SOME = 0.05, 1000
+#: Precision of the size of the spread, relative; its smallest size, m; number of heliostats whose
+#: paths decide the side.
+_PRECISION, _SMALLEST, _SOME = 0.05, 1.0, 1000
 #: Longest return to the receiver, relative to that from today's points.
 LONGEST_RETURN = 1.1
 
@@ -164,23 +165,24 @@ class StandbyField:
             If no spread keeps the limit and the return, or a heliostat has no clear point.
         """
         side = self._side()
-        size = self._largest(side)
-        low, best, tried = 0.0, self._points(side, size), 0
-        if not self._keeps(best, limit):
-            raise self._too_low(best, limit, size)
-        while size - low > _PRECISION * size:
-            # The light falls about with the area, and small spreads are refused at once.
+        largest = self._largest(side)
+        if not self._keeps(self._points(side, largest), limit):
+            raise self._too_low(self._points(side, largest), limit, largest)
+        # The beams pass the same points at every sun, so one sun is enough to find the size.
+        low, size, tried = 0.0, largest, 0
+        while size - low > _PRECISION * size and size > _SMALLEST:
             middle = 0.5 * (low + size) if low else 0.6 * size
+            if self._keeps(self._points(side, middle), limit, suns=1):
+                size = middle
+            else:
+                low = middle
             tried += 1
             if progress is not None:
                 progress(tried, 0)
-            points = self._points(side, middle)
-            if self._keeps(points, limit):
-                size, best = middle, points
-            elif (low := middle) and size < 1.0:
-                break
-        self._check_eyes(best)
-        return best
+        while not self._keeps(points := self._points(side, size), limit):
+            size = min(size * (1.0 + _PRECISION), largest)
+        self._check_eyes(points)
+        return points
 
     def glare(
         self,
@@ -217,10 +219,10 @@ class StandbyField:
     def _returns(moves: FloatArray) -> FloatArray:
         return np.array([_returned(row) for row in moves])
 
-    def _keeps(self, points: FloatArray, limit: float) -> bool:
+    def _keeps(self, points: FloatArray, limit: float, suns: int | None = None) -> bool:
         return self._back_in_time(points) and all(
             stays_below(self._beams(points, sun), self.center, self._around, limit)
-            for sun in self.suns
+            for sun in self.suns[:suns]
         )
 
     def _beams(self, points: FloatArray, sun: FloatArray) -> Beams:
@@ -244,8 +246,8 @@ class StandbyField:
             place[left] = following + np.arange(len(left))
             following += len(left)
         raise InputError(
-            f"standby: {len(left)} heliostats, the first {self.check.names[left[0]]}, find no point "
-            f"within {self._inner + size:.0f} m of the receiver from which no beam enters a "
+            f"standby: {len(left)} heliostats, the first {self.check.names[left[0]]}, find no "
+            f"point within {self._inner + size:.0f} m of the receiver from which no beam enters a "
             "receiver, a target or a keep-out volume; move their standby_m, or these volumes"
         )
 
@@ -291,8 +293,8 @@ class StandbyField:
     def _largest(self, side: float) -> float:
         """Return the largest spread that keeps the height and the return, m."""
         height = float(self.center[2] - self._vertex[:, 2].max())
-        size = max(_FARTHEST * height - self._inner, 1.0)
-        while size > 1.0 and not self._back_in_time(self._points(side, size)):
+        size = max(_FARTHEST * height - self._inner, _SMALLEST)
+        while size > _SMALLEST and not self._back_in_time(self._points(side, size)):
             size *= 0.9
         return size
 
