@@ -108,7 +108,7 @@ def _print(rests: "dict[str, Rest]", suns: "FloatArray") -> None:
                     _sun_text(sun) if name == "today" else "",
                     name,
                     f"{light.suns:.0f}, at most {light.bound:.0f}",
-                    ", ".join(f"{x:.0f}" for x in light.point),
+                    ", ".join(f"{round(x)}" for x in light.point),
                     f"{np.median(moves):.1f} s, {moves.max():.1f} s",
                     f"{rest.returns[k]:.0f} s",
                     str(rest.blocked[k]),
