@@ -172,7 +172,7 @@ def glare(
             row["eye"],
             *(f"{row[key]:.0f} h" for key in ("low_h", "after_image_h", "damage_h")),
             f"{row['suns']:.3g}",
-            _sun_text(year.sun),
+            _sun_text(year.sun) if year.suns else "no light",
         )
         for row, year in zip(documents, years, strict=True)
     ]
