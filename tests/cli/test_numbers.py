@@ -64,6 +64,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "flux": ("flux.toml", "--sun", "0,0.6,0.8", "--cells", "4x8"),
     "aim": ("flux.toml", "--limit", "1e4", "--sun", "0,0.6,0.8", "--cells", "4x8"),
     "standby": ("plant.toml",),
+    "glare": ("plant.toml",),
     "surface": ("plant.toml", ".", "--heliostat", "A1"),
     "image": ("a.png", "--plant", "plant.toml", "--no-pictures", "--processes", "1"),
     "calibrate": ("plant.toml", "--sightings", "s.csv", "--model", "tilt_north,tilt_east"),
