@@ -226,6 +226,10 @@ def test_ctl_at_the_plant_itself(ctl: Callable[..., Any], console: LiveConsole) 
     assert ctl("operator", *where, "command", "unlock", name).exit_code == 0
     aimed = ctl("operator", *where, "aim", "0,-3,200", name)
     assert "AIM: 1" in aimed.stdout, aimed.output
+    points = console.folder / "points.csv"
+    points.write_text(f"heliostat,east_m,north_m,up_m\n{name},3,-9,14\n")
+    rests = ctl("operator", *where, "standby", str(points))
+    assert "STANDBY: 1" in rests.stdout, rests.output
     out = ctl("operator", *where, "out-of-service", name, "--reason", "washing")
     assert out.exit_code == 0, out.output
     assert f"OUT_OF_SERVICE: 1 done ({name}: parked in stow and locked out; " in out.stdout

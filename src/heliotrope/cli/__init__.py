@@ -32,6 +32,7 @@ from heliotrope.cli.parameters import parameters
 from heliotrope.cli.plan import plan
 from heliotrope.cli.run.command import GroupedCommand, run
 from heliotrope.cli.simulate import simulate
+from heliotrope.cli.standby import glare, standby
 from heliotrope.cli.sun import sun
 from heliotrope.cli.surface import surface
 from heliotrope.cli.track import track
@@ -75,6 +76,8 @@ app.add_typer(field_app, name="field")
 app.add_typer(camera_app, name="camera")
 app.command()(flux)
 app.command()(aim)
+app.command()(standby)
+app.command()(glare)
 app.command()(image)
 app.command()(surface)
 app.command()(calibrate)

@@ -61,7 +61,7 @@ class AtPlant:
             If the plant refuses the request, or cannot be reached.
         """
         request, arguments, blob = f"{method} {path}", dict(body or {}), b""
-        if request == "POST aim":
+        if request in ("POST aim", "POST standby"):
             points = arguments.pop("points", {})
             arguments["points"] = list(points)
             blob = array("d", [x for point in points.values() for x in point]).tobytes()

@@ -651,6 +651,22 @@ def aim(
 
 
 @app.command()
+def standby(
+    context: typer.Context,
+    points: Annotated[
+        Path, typer.Argument(help="Standby points (CSV), as written by `heliotrope standby`.")
+    ],
+    wait: Wait = 60.0,
+) -> None:
+    """Set standby points of heliostats; each is checked against volumes and eyes."""
+    from heliotrope.field.points import read_points
+
+    order = {"points": {name: point.tolist() for name, point in read_points(points).items()}}
+    with _client(context) as client:
+        _follow_with_authority(client, "standby", order, wait)
+
+
+@app.command()
 def emergency(
     context: typer.Context,
     act: Annotated[str, typer.Option(help="DEFOCUS or STOW.")] = "DEFOCUS",

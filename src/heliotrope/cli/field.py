@@ -1,16 +1,20 @@
 """``heliotrope field``: create and check plant files."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from heliotrope.cli._common import print_json, print_table
 
-#: Sun positions for `defocus`: azimuth from noon, and elevation, degrees.
+if TYPE_CHECKING:
+    from heliotrope.geometry import FloatArray
+
+#: Sun positions of `noon_suns`: azimuth from noon, and elevation, degrees.
 _SUNS = ((0.0, 65.0), (0.0, 40.0), (90.0, 30.0), (-70.0, 20.0))
-#: Distance from the receiver up to which beams are followed there, m.
-_AROUND = 100.0
+#: Distance from the receiver up to which light is sought, m, and the light whose extent is printed,
+#: suns.
+_AROUND, _BRIGHT = 200.0, 10.0
 
 app = typer.Typer(help="Create and check plant files.", no_args_is_help=True)
 
@@ -112,8 +116,7 @@ def defocus(
 
     from heliotrope.errors import InputError
     from heliotrope.field.formats import plant_file
-    from heliotrope.geometry import direction
-    from heliotrope.optics.standing import hottest
+    from heliotrope.optics.standing import hottest, reach_of
     from heliotrope.plant.field.aims import BeamCheck, default_aims
     from heliotrope.plant.motion.defocusing import defocused_field
 
@@ -126,16 +129,16 @@ def defocus(
     defaults = default_aims(design, design.names, check.armature.origin_1, None)
     aims, center = np.stack(list(defaults.values())), design.receivers[0].center
     documents = []
-    for bearing, elevation in _SUNS:
-        # The sun is highest towards the equator.
-        azimuth = bearing + (0.0 if design.site.latitude_deg < 0.0 else 180.0)
-        sun = direction(np.radians(azimuth), np.radians(elevation))
+    for sun in noon_suns(design.site.latitude_deg):
+        azimuth, elevation = np.degrees([np.arctan2(sun[0], sun[1]), np.arcsin(sun[2])]).tolist()
         row: dict[str, float] = {"azimuth_deg": azimuth % 360.0, "elevation_deg": elevation}
         for name, alike in (("same", True), ("spread", False)):
             angles = defocused_field(check, aims, sun, alike=alike)
-            hot = hottest(check.together(angles, sun), center, _AROUND)
+            beams = check.together(angles, sun)
+            hot = hottest(beams, center, _AROUND)
             away = float(np.linalg.norm(hot.point - center))
-            row |= {f"{name}_suns": hot.suns, f"{name}_m": away, f"{name}_reach_m": hot.reach}
+            row |= {f"{name}_suns": hot.suns, f"{name}_m": away, f"{name}_bound_suns": hot.bound}
+            row[f"{name}_reach_m"] = reach_of(beams, center, _AROUND, _BRIGHT)
         documents.append(row)
     if as_json:
         print_json(documents)
@@ -151,6 +154,17 @@ def defocus(
         for row in documents
     ]
     print_table(heads, rows)
+
+
+def noon_suns(latitude_deg: float) -> "FloatArray":
+    """Return the sun positions at which the light of resting beams is examined, (4, 3)."""
+    import numpy as np
+
+    from heliotrope.geometry import direction
+
+    # The sun is highest towards the equator.
+    noon = 0.0 if latitude_deg < 0.0 else 180.0
+    return np.stack([direction(np.radians(noon + a), np.radians(e)) for a, e in _SUNS])
 
 
 Plant = Annotated[Path, typer.Argument(help="Plant file (TOML).")]

@@ -8,7 +8,9 @@ import numpy.typing as npt
 
 from heliotrope.field.volumes import Volume
 from heliotrope.geometry import FloatArray, as_float, normalize, reflect
-from heliotrope.optics.beam import SUN_RADIUS, Beams, MirrorOptics, crossing
+from heliotrope.jit import as_input
+from heliotrope.optics._air_kernels import light_at, reach, strongest
+from heliotrope.optics.beam import SUN_RADIUS, Beams, MirrorOptics
 from heliotrope.optics.keep_out import bounds, find_entries
 
 #: Largest declination of the sun, rad, and allowance for refraction, which lifts the sun at the
@@ -21,9 +23,12 @@ _STEP = float(np.radians(1.0))
 _POINTS = 1000
 #: Number of points of each beam on both sides of the place, and steps of the search about the
 #: hottest point, m.
-_ALONG, _COARSE, _FINE = 25, 4.0, 0.2
-#: Pairs of a point and a beam that are computed at once.
-_PAIRS = 200_000
+_ALONG, _COARSE, _FINE = 25, 2.0, 0.05
+#: Fraction by which the bound may exceed the strongest light found, half of the sides of the
+#: smallest cubes, m, and bounds of beams that may be computed; then the bound is less close.
+_SHARE, _LEAST, _WORK = 0.05, 0.02, 2_000_000_000
+#: Half of the sides of the smallest cubes of `reach_of`, m.
+_LEAST_REACH = 0.05
 
 
 def suns_of_the_year(latitude: float) -> FloatArray:
@@ -37,13 +42,38 @@ def suns_of_the_year(latitude: float) -> FloatArray:
         Latitude, rad, north positive.
     """
     declination = np.arange(-_TROPIC, _TROPIC + _STEP, _STEP)
-    hour = np.arange(-np.pi, np.pi, _STEP)
+    suns = _suns_at(latitude, declination, np.arange(-np.pi, np.pi, _STEP))
+    return as_float(suns[suns[:, 2] > -_REFRACTION])
+
+
+def hours_of_the_year(
+    latitude: float, days: int = 24, every: float = 0.5
+) -> tuple[FloatArray, FloatArray]:
+    """Return sun positions of the year, (S, 3), and the daylight hours each stands for, (S,).
+
+    Parameters
+    ----------
+    latitude
+        Latitude, rad, north positive.
+    days
+        Number of days, evenly spaced over the year.
+    every
+        Time between sun positions of a day, h.
+    """
+    turn = 2.0 * np.pi * (np.arange(days) + 0.5) / days
+    hour = np.arange(-12.0 + 0.5 * every, 12.0, every) * np.pi / 12.0
+    suns = _suns_at(latitude, np.arcsin(np.sin(_TROPIC) * np.sin(turn)), hour)
+    suns = as_float(suns[suns[:, 2] > 0.0])
+    return suns, np.full(len(suns), 365.25 / days * every)
+
+
+def _suns_at(latitude: float, declination: FloatArray, hour: FloatArray) -> FloatArray:
+    """Return unit vectors, ENU, (D · H, 3), at declinations (D,) and hour angles (H,), rad."""
     d, h = (angle.ravel() for angle in np.meshgrid(declination, hour))
     polar, equal = np.sin(d), np.cos(d) * np.cos(h)
     sine, cosine = np.sin(latitude), np.cos(latitude)
     north, up = cosine * polar - sine * equal, sine * polar + cosine * equal
-    suns = np.stack([-np.cos(d) * np.sin(h), north, up], axis=-1)
-    return as_float(suns[up > -_REFRACTION])
+    return as_float(np.stack([-np.cos(d) * np.sin(h), north, up], axis=-1))
 
 
 def entered_over_the_year(
@@ -145,56 +175,105 @@ class Hottest:
         direct sun.
     point
         ENU, m, (3,).
-    reach
-        Largest distance from the centre at which more than the limit was found, m; 0 if it was
-        found nowhere.
+    bound
+        Irradiance that is exceeded nowhere, in suns.
     """
 
     suns: float
     point: FloatArray
-    reach: float
+    bound: float
 
 
-def hottest(beams: Beams, center: FloatArray, around: float, limit: float = 10.0) -> Hottest:
+def hottest(beams: Beams, center: FloatArray, around: float) -> Hottest:
     """Return where beams, taken together, are strongest near a place in the air.
 
-    First, evenly spaced points on the beams' axes are evaluated, then the neighbourhood of the best
-    of these points. A narrow peak between the points may be missed.
+    The cube about the place is divided until no part of it can have more light than `bound`, which
+    is usually within a tenth of `suns`; no peak is missed. There is no air below the lowest mirror.
 
     Parameters
     ----------
     beams
         N beams.
     center
-        The middle of the search, such as a receiver's, ENU, m, (3,).
+        The middle of the cube, such as a receiver's, ENU, m, (3,).
     around
-        Distance from the centre up to which each beam is followed, m.
-    limit
-        Limit for `Hottest.reach`, in suns.
+        Half of the cube's side, m.
     """
+    packed = _packed(beams)
+    best = _climbed(packed, beams, center, around)
+    middle, half, low = _cube(beams, center, around)
+    bound = strongest(packed, low, middle, half, SUN_RADIUS, _SHARE, _LEAST, _WORK, np.inf, best)
+    return Hottest(float(best[3]), best[:3].copy(), float(bound))
+
+
+def stays_below(beams: Beams, center: FloatArray, around: float, limit: float) -> bool:
+    """Return whether beams, taken together, certainly nowhere exceed a limit, in suns.
+
+    For the cube of air see `hottest`. The result is False as well where the search could not
+    decide, which happens only close to the limit.
+    """
+    packed = _packed(beams)
+    best = _climbed(packed, beams, center, around)
+    if best[3] > limit:
+        return False
+    best[3] = limit
+    middle, half, low = _cube(beams, center, around)
+    bound = strongest(packed, low, middle, half, SUN_RADIUS, 0.0, _LEAST, _WORK, limit, best)
+    return bool(bound <= limit)
+
+
+def reach_of(beams: Beams, center: FloatArray, around: float, limit: float) -> float:
+    """Return the distance from a place beyond which beams nowhere exceed a limit, m.
+
+    The result errs on the safe side; it is 0 if the limit is exceeded nowhere. For the cube of air
+    see `hottest`; the limit is in suns.
+    """
+    _, half, low = _cube(beams, center, around)
+    return float(reach(_packed(beams), low, center, half, SUN_RADIUS, limit, _LEAST_REACH))
+
+
+def _packed(beams: Beams) -> FloatArray:
+    """Return beams as rows for the kernels."""
+    mirrors = beams.mirrors
+    radius = np.sqrt(mirrors.area / np.pi)
+    columns = (radius, 1.0 / mirrors.focus, beams.reach, mirrors.reflectivity)
+    return as_input(np.column_stack([beams.origin, beams.direction, *columns]))
+
+
+def _cube(beams: Beams, center: FloatArray, around: float) -> tuple[FloatArray, float, float]:
+    """Return the middle and half of the side of a cube, and the height of its lowest air, m.
+
+    The cube is a little off the place: the beams often cross right there, and a peak on the corner
+    of eight cubes would have to be found eight times.
+    """
+    off = around * np.array([0.031, 0.017, 0.023])
+    return center + off, 1.031 * around, float(beams.origin[:, 2].min(initial=np.inf))
+
+
+def _climbed(packed: FloatArray, beams: Beams, center: FloatArray, around: float) -> FloatArray:
+    """Return a place with much light, and its light, (4,): the best of some points, improved."""
     near = np.einsum("nk,nk->n", center - beams.origin, beams.direction)
-    points = beams.point(near[:, None] + np.linspace(-around, around, _ALONG)).reshape(-1, 3)
+    along = around * np.linspace(-1.0, 1.0, _ALONG) ** 3
+    points = beams.point(near[:, None] + along).reshape(-1, 3)
     chosen = np.unique(np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(np.intp))
     points = points[chosen]
-    suns = _suns(beams, points)
-    away = np.linalg.norm(points - center, axis=-1)
-    reach = float(np.max(away, where=suns > limit, initial=0.0))
+    points = points[points[:, 2] > beams.origin[:, 2].min(initial=np.inf)]
+    if not len(points):
+        return np.append(center, 0.0)
+    suns = _suns(packed, points)
     best, most, step = points[suns.argmax()], float(suns.max()), _COARSE
     while step > _FINE:
-        grid = np.stack(np.meshgrid(*[np.arange(-2, 3) * step] * 3), axis=-1).reshape(-1, 3) + best
-        suns = _suns(beams, grid)
+        grid = np.stack(np.meshgrid(*[np.arange(-1, 2) * step] * 3), axis=-1).reshape(-1, 3) + best
+        suns = _suns(packed, grid)
         if suns.max() > most * (1.0 + 1e-6):
             best, most = grid[suns.argmax()], float(suns.max())
         else:
             step *= 0.5
-    return Hottest(
-        most,
-        as_float(best),
-        max(reach, float(np.linalg.norm(best - center)) if most > limit else 0.0),
-    )
+    return np.append(best, most)
 
 
-def _suns(beams: Beams, points: FloatArray) -> FloatArray:
+def _suns(packed: FloatArray, points: FloatArray) -> FloatArray:
     """Return the irradiance from all beams at points (P, 3), in suns, (P,)."""
-    parts = np.array_split(points, 1 + len(points) * len(beams) // _PAIRS)
-    return np.concatenate([crossing(beams, part, dni=1.0).irradiance for part in parts])
+    suns = np.zeros(len(points))
+    light_at(packed, as_input(points), SUN_RADIUS, suns)
+    return suns

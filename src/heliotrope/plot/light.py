@@ -6,7 +6,8 @@ import numpy as np
 
 from heliotrope.aims.plan import AimPlan
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.geometry import normalize, tangent_axes
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray, normalize, tangent_axes
 from heliotrope.optics.flux import FluxView
 from heliotrope.optics.plant_flux import EFFICIENCIES, PlantFlux
 from heliotrope.optics.surfaces import Cavity, Cylinder, Mesh, Plate, Surface
@@ -70,6 +71,29 @@ def receiver_map(
     ax.set_xlabel("right, m")
     ax.set_ylabel("up, m")
     return ax
+
+
+def standby_figure(plant: Plant, today: FloatArray, points: FloatArray) -> "Figure":
+    """Draw standby points (N, 3) from the side that the receiver faces, and today's points."""
+    import matplotlib.pyplot as plt
+    from matplotlib.patches import Rectangle
+
+    receiver = plant.receivers[0]
+    right = normalize(np.cross([0.0, 0.0, 1.0], receiver.normal), "normal of the receiver")
+    figure, ax = plt.subplots(figsize=(7.0, 5.5), layout="constrained")
+    away = np.linalg.norm(plant.position - receiver.center, axis=-1)
+    dots = ax.scatter(
+        (points - receiver.center) @ right, points[:, 2], 6.0, c=away, cmap=_SHARE, rasterized=True
+    )
+    figure.colorbar(dots, ax=ax, label="distance of the heliostat, m")
+    ax.scatter((today - receiver.center) @ right, today[:, 2], 60.0, c="red", marker="x")
+    corner = (-0.5 * receiver.width, receiver.center[2] - 0.5 * receiver.height)
+    ax.add_patch(Rectangle(corner, receiver.width, receiver.height, color="black"))
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_title(f"{plant.name}: standby points; today's in red", fontsize=10)
+    ax.set_xlabel("right of the receiver, m")
+    ax.set_ylabel("height, m")
+    return figure
 
 
 def efficiency_map(found: PlantFlux, by: str = "total", *, ax: "Axes | None" = None) -> "Axes":

@@ -503,6 +503,27 @@ class BeamCheck:
             mirrors = replace(mirrors, focus=focus)
         return standing_beams(vertex, normal, sun, mirrors, FAR)
 
+    def at_rest(
+        self, rows: npt.NDArray[np.intp], points: FloatArray, sun: FloatArray
+    ) -> npt.NDArray[np.bool_]:
+        """Return which heliostats may rest with their beams at points.
+
+        The heliostats must reach the points, and the beams must not enter receivers, targets or
+        keep-out volumes on their way to the points or beyond.
+
+        Parameters
+        ----------
+        rows, points
+            Indices of the heliostats, (K,), and points, ENU, m, (K, 3).
+        sun
+            Sun vector, (3,).
+        """
+        solved = self.poses(rows, points, sun)
+        rest = beams(solved.chosen(solved.vertex), points, _rows_of(self.mirrors, rows), reach=FAR)
+        volumes = (*self.solids, *self._targets, *self.volumes)
+        entered = find_entries(rest, volumes).entered.any(axis=-1)
+        return np.asarray((solved.chosen(solved.status) == TrackingStatus.OK) & ~entered)
+
     def inside(self, row: int, poses: FloatArray, sun: FloatArray) -> npt.NDArray[np.bool_]:
         """Return a mask of the poses in which the beam of a heliostat is in a volume.
 
