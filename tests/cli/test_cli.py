@@ -398,6 +398,8 @@ def test_calibrate_a_plant_with_a_table(call: Any, plant_file: Path, tmp_path: P
     # A tilt to the north of 5 mrad, and a bias of −3 mrad: a zero of +3 mrad in his sense.
     assert his["psi_t_deg"] == pytest.approx(np.degrees(5e-3), rel=0.1)
     assert his["gamma_0_deg"] == pytest.approx(np.degrees(3e-3), rel=0.1)
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png;base64,") == 2 + report.MOST_SECTIONS
     values = [h["parameters"]["tilt_north"] for h in found["heliostats"].values()]
     np.testing.assert_allclose(np.median(values), 5e-3, atol=2e-4)
     # The field takes it back: as a plant, and as a calibration beside the old one.

@@ -8,6 +8,7 @@ import pytest
 
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Stage
+from heliotrope.plant.operations import operations
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.errands import Errands, Step
 from heliotrope.plant.orders.authority import Person, RefusedError, Role
@@ -157,7 +158,11 @@ def test_a_calibration_waits_for_the_start_and_names_the_lock(place: str) -> Non
     live(work, WORK)
 
 
-def test_one_that_does_not_come_to_stow_is_named_with_an_alarm_and_the_ticket_ends() -> None:
+def test_one_that_does_not_come_to_stow_is_named_with_an_alarm_and_the_ticket_ends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(operations, "_PARKED", 330.0)
+
     async def work(plant: LivePlant) -> None:
         shown, name = plant.operations, plant.names[0]
         await until(lambda: shown.viewer.heliostat(name).state == "TRACKING")
@@ -170,7 +175,7 @@ def test_one_that_does_not_come_to_stow_is_named_with_an_alarm_and_the_ticket_en
         assert retry.work == "stow of a heliostat out of service"
         await followed(ticket)
         assert ticket.refusals[name].startswith(
-            "not finished within 600 s: on its way to stow: not h"
+            "not finished within 330 s: on its way to stow: not h"
         )
         found = [a for a in shown.logbook.alarms() if a.condition == "not_parked" and a.active]
         assert [alarm.subject for alarm in found] == [name]

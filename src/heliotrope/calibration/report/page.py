@@ -46,7 +46,7 @@ def write_report(
     folder: Path,
     progress: Callable[[int, int], None] | None = None,
     *,
-    most: int = MOST_SECTIONS,
+    most: int | None = None,
 ) -> Path:
     """Write the page and the files beside it, and return the path of the page.
 
@@ -63,7 +63,8 @@ def write_report(
     progress
         Called with the numbers of plots (done, total) after each plot.
     most
-        Maximum number of heliostats that get their own plots; the largest errors come first.
+        Maximum number of heliostats that get their own plots; the largest errors come first. None:
+        `MOST_SECTIONS`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     learned, r = report.learned, report.results
@@ -73,6 +74,7 @@ def write_report(
     units = {n: learned.mechanism.parameter(n).unit for n in r.names}
     write_parquet(folder / "calibration.parquet", units, r)
     write_plant(report.calibrated, folder / "plant.toml")
+    most = MOST_SECTIONS if most is None else most
     rows = sorted(report.rows, key=lambda row: -np.nan_to_num(row.after.median))[:most]
     rows = sorted(rows, key=lambda row: row.name)
     sections = []
