@@ -230,7 +230,12 @@ def _front_view(surface: Mesh | Cavity, view: FluxView) -> Any:
     order = order[cells.normal[order] @ front > 0.0]
     corners = (_faces(surface)[order] - surface.center) @ axes.T
     # Without smoothing and with edges of their own colour there are no seams between cells.
-    look: dict[str, Any] = {"edgecolors": "face", "linewidths": 0.4, "antialiaseds": False, "rasterized": True}
+    look: dict[str, Any] = {
+        "edgecolors": "face",
+        "linewidths": 0.4,
+        "antialiaseds": False,
+        "rasterized": True,
+    }
     drawn = PolyCollection(corners, cmap=_FLUX, **look)
     drawn.set_array(1e-3 * view.flux.ravel()[order])
     return drawn
