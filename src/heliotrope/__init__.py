@@ -80,7 +80,7 @@ if TYPE_CHECKING:
     from heliotrope.optics import flux_day, flux_year, image_offsets
     from heliotrope.sun import Site
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 #: The module of each name.
 _HOMES = {
