@@ -22,7 +22,7 @@ help:  ## list the targets
 
 setup: $(STAMP)  ## make the environment in .venv
 
-$(STAMP): pyproject.toml constraints.txt requirements.lock scripts/setup.sh
+$(STAMP): pyproject.toml constraints.txt requirements.lock scripts/setup.sh src/heliotrope/__init__.py
 	@PYTHON="$(PYTHON)" VENV="$(VENV)" bash scripts/setup.sh
 	@touch $@
 
