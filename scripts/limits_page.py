@@ -15,8 +15,9 @@ SAID = """# Limits and periods
 This page lists, by module, every named number of the control code with its meaning, and the default
 of every numeric setting. It is generated from the code (`python -m scripts.pages`), and a test
 fails if the page and the code differ, so that no limit changes unnoticed. A name that begins with
-an underscore is private to its module. The settings that a user can change are described with the
-[plant file](plant-format.md) and the [cluster file](cluster-format.md).
+an underscore is private to its module. A meaning that covers several names is repeated for each of
+them, and explains them in the order in which they are listed. The settings that a user can change
+are described with the [plant file](plant-format.md) and the [cluster file](cluster-format.md).
 """
 
 

@@ -31,19 +31,19 @@ KINDS = {
 }
 
 #: Said below the table of models.
-ROLES = """`malan8`, `guo6` and `khalsa8` are listed here for azimuth-elevation mechanisms; for another kind of
-mechanism, the model consists of that kind's own parameters with the same roles. Roles are
-`position`, `tilts`, `biases`, `scales`, `non_orthogonality` and `canting`. Models, roles and
-parameters can be combined: `malan8+canting`, `tilts+biases+sag`."""
+ROLES = """`malan8`, `guo6` and `khalsa8` are listed here for azimuth-elevation mechanisms. For
+another kind of mechanism, the model consists of that kind's own parameters with the same roles.
+Roles are `position`, `tilts`, `biases`, `scales`, `non_orthogonality` and `canting`. Models, roles
+and parameters can be combined: `malan8+canting`, `tilts+biases+sag`."""
 
 
 def pages() -> dict[str, str]:
     """Return the page's text, by path."""
     said = (
-        "Each parameter is a deviation from the nominal mechanism. This page is generated from the table "
-        "in the program (`python -m scripts.pages`). The names of drive parameters begin with the name "
-        "of the drive's joint. Other kinds of mechanism have the same rows, with the names of their own "
-        "joints."
+        "Each parameter is a deviation from the nominal mechanism. This page is generated from the "
+        "table in the program (`python -m scripts.pages`). The names of drive parameters begin "
+        "with the name of the drive's joint. Other kinds of mechanism have the same rows, with the "
+        "names of their own joints."
     )
     lines = ["# Parameters of a mechanism", "", said]
     for kind, (joints, linear) in KINDS.items():
