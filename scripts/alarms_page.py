@@ -10,13 +10,14 @@ PAGE = "docs/reference/alarms.md"
 _INTRO = """\
 # Alarms and refusals
 
-Every alarm that the code can raise, and every reason for which the plant refuses a command.
-`python -m scripts.pages` writes this page from the code. The limits are the defaults of the
-[safety table](../explanation/safety.md). The [handbook](../how-to/handbook.md#alarms) tells the
-operator the same in fewer words.
+This page lists every alarm that the code can raise, and every reason for which the plant refuses a
+command. `python -m scripts.pages` generates it from the code. The limits are the defaults of the
+[safety table](../explanation/safety.md). The [handbook](../how-to/handbook.md#alarms) describes the
+alarms more briefly, for operators.
 
 An alarm's text says what is wrong and where, what happens by itself, and what to do. Words in
-braces are filled in when it is raised. The column *Time* of the console says since when.
+braces are replaced by actual values when the alarm is raised. The column *Time* of the console
+shows since when the alarm has been active.
 
 Severities, from the least serious: **info**, **warning**, **alarm**, **emergency**.
 """
@@ -24,9 +25,10 @@ Severities, from the least serious: **info**, **warning**, **alarm**, **emergenc
 _REFUSALS = """
 ## Refusals
 
-A refused command was not sent, and nothing moves. The plant refuses DEFOCUS, STOW and EMERGENCY to
-nobody; a cluster refuses names that its file lacks, and a heliostat without power, with stalled
-drives or switched off at the mirror cannot obey. Over HTTP a refusal has the status 409.
+A refused command is not sent, and nothing moves. The plant never refuses DEFOCUS, STOW or
+EMERGENCY, whoever gives the order. A cluster, however, refuses heliostat names that are not in its
+file, and a heliostat cannot obey if it has no power, if its drives are stalled, or if they are
+switched off at the mirror. Over HTTP, a refusal has the status 409.
 
 | refusal | when | text | what to do |
 |---|---|---|---|

@@ -12,11 +12,12 @@ PAGE = "docs/reference/limits.md"
 PACKAGES = ("safety", "plant", "cluster", "lcu", "links")
 SAID = """# Limits and periods
 
-Every number that the control code names and explains, by module, and the default of every numeric
-setting. This page is made from the running code (`python -m scripts.pages`), and a test
-fails while the two differ, so that nobody changes a limit unnoticed. A name that begins with an
-underscore belongs to its module. What can be set is in the
-[plant file](plant-format.md) and the [cluster file](cluster-format.md).
+This page lists, by module, every named number of the control code with its meaning, and the default
+of every numeric setting. It is generated from the code (`python -m scripts.pages`), and a test
+fails if the page and the code differ, so that no limit changes unnoticed. A name that begins with
+an underscore is private to its module. A meaning that covers several names is repeated for each of
+them, and explains them in the order in which they are listed. The settings that a user can change
+are described with the [plant file](plant-format.md) and the [cluster file](cluster-format.md).
 """
 
 

@@ -31,18 +31,19 @@ KINDS = {
 }
 
 #: Said below the table of models.
-ROLES = """`malan8`, `guo6` and `khalsa8` are written down for azimuth and elevation; another kind
-takes its own parameters of the same role. Roles are `position`, `tilts`, `biases`, `scales`,
-`non_orthogonality` and `canting`. Models, roles and parameters may be joined: `malan8+canting`,
-`tilts+biases+sag`."""
+ROLES = """`malan8`, `guo6` and `khalsa8` are listed here for azimuth-elevation mechanisms. For
+another kind of mechanism, the model consists of that kind's own parameters with the same roles.
+Roles are `position`, `tilts`, `biases`, `scales`, `non_orthogonality` and `canting`. Models, roles
+and parameters can be combined: `malan8+canting`, `tilts+biases+sag`."""
 
 
 def pages() -> dict[str, str]:
     """Return the page's text, by path."""
     said = (
-        "Each is a deviation from the nominal mechanism. This page is made from the table in the "
-        "program (`python -m scripts.pages`). Drives' parameters take the name of their joint; "
-        "other kinds have the same rows with their joints' names."
+        "Each parameter is a deviation from the nominal mechanism. This page is generated from the "
+        "table in the program (`python -m scripts.pages`). The names of drive parameters begin "
+        "with the name of the drive's joint. Other kinds of mechanism have the same rows, with the "
+        "names of their own joints."
     )
     lines = ["# Parameters of a mechanism", "", said]
     for kind, (joints, linear) in KINDS.items():
@@ -60,6 +61,8 @@ def pages() -> dict[str, str]:
     lines += ["", "## Models", "", "| model | parameters |", "|---|---|"]
     for name, parameters in MODELS.items():
         lines.append(f"| `{name}` | {', '.join(f'`{p}`' for p in parameters)} |")
-    lines.append("| `full` | all of a mechanism's but worm and pivot radius |")
+    lines.append(
+        "| `full` | all parameters of a mechanism except the worm parameters and the pivot radius |"
+    )
     lines += ["", ROLES]
     return {PAGE: "\n".join(lines) + "\n"}

@@ -20,49 +20,51 @@ GROUPS = {
 }  # fmt: skip
 FRAME = f"""# The wire, version 2
 
-This page is made from the tables in the program (`python -m scripts.pages`); the code is `heliotrope.lcu.wire`, `signing`, `messages` and `journal`.
+This page specifies the frames and messages on the bus between a cluster and its local controllers. It is generated from the tables in the program (`python -m scripts.pages`); the code is in `heliotrope.lcu.wire`, `signing`, `messages` and `journal`.
 
 ## A frame
 
-Numbers are little-endian. COBS removes every zero from the frame, and a zero ends it; with both it is at most {wire.FRAME_LIMIT} bytes long.
+Numbers are little-endian. COBS encoding removes every zero byte from the frame, and a zero byte ends it. Including the COBS overhead and the final zero, a frame is at most {wire.FRAME_LIMIT} bytes long.
 
 | bytes | content |
 |---|---|
 | 1 | version, {wire.VERSION}; {wire.SIGNED} if the frame is signed |
-| 2 | to: address, 0xFFFF all, 0 the cluster controller |
-| 2 | from |
-| 2 | sequence |
-| 1 | type |
+| 2 | address of the receiver; 0xFFFF: all; 0: the cluster controller |
+| 2 | address of the sender |
+| 2 | sequence number |
+| 1 | type of the message |
 | 0 to {wire.PAYLOAD_LIMIT} | payload |
-| {wire.MAC_SIZE} | MAC, in messages that store: HMAC-SHA256 over all before it, truncated; in signed frames: their tag |
-| 4 | CRC-32 over all before it (that of zlib) |
+| {wire.MAC_SIZE} | in messages that store settings: MAC, a truncated HMAC-SHA256 over all preceding bytes; in signed frames: the tag; absent in all other frames |
+| 4 | CRC-32 over all preceding bytes (the same CRC as in zlib) |
 
-A frame whose stuffing, checksum, version or length is wrong changes nothing but a counter. A type that is not in the table is passed on with its bytes. A frame whose payload holds a number that is not finite does not act.
+A frame with invalid byte stuffing, checksum, version or length has no effect except that it increments a counter. A frame of a type that is not in the table is decoded, and its payload is passed on as bytes. A frame whose payload contains a non-finite number has no effect.
 
 ## What acts
 
-- DEFOCUS and STOW, from anyone, always.
-- Questions, always: they change nothing.
-- Everything else must be new. The sender counts its frames in 32 bits; the lower 16 are the sequence, and once a second it broadcasts SESSION with the upper ones, its epoch and the token of the authority. A SESSION is accepted if its (epoch, count) is greater than the one held; any other frame, if its sequence is 1 to 32767 after the last one accepted. After a restart of the receiver or {wire.SILENCE_MS // 1000} s of silence, a SESSION must come first. The epoch rises with every start of the sender: the GPS second of the start serves.
-- A command of the authority must carry the token of the last SESSION (0 is nobody's) and must not have expired: its last second is at most {wire.HORIZON_S} s ahead by the receiver's clock. Without a clock every command is void.
-- A message that stores must also carry the MAC of the receiver's key, and an edition greater than the last one stored. The edition is kept in the journal with what was set, so a recorded message is void for ever.
+A local controller acts on a frame under these conditions:
 
-All except the MAC prevents accidents; it does not stop a person at the bus. Signed frames do.
+- DEFOCUS and STOW always act, whoever sends them.
+- Questions are always answered, because they change nothing.
+- Any other frame must be new. The sender numbers its frames with a 32-bit counter. Each frame carries the lower 16 bits as its sequence number. Once a second, the sender broadcasts SESSION with the upper 16 bits, its epoch and the token of the command authority. A SESSION is accepted if its pair (epoch, count) is greater than that of the last accepted SESSION. Any other frame is accepted if its sequence number is 1 to 32767 after the last accepted one. After a restart of the receiver or {wire.SILENCE_MS // 1000} s of silence, no other frame is accepted before a SESSION. The epoch must increase with every start of the sender; for example, it can be the GPS second of the start.
+- A command that needs the command authority must carry the token of the last SESSION (0 means that nobody has the authority) and must not have expired: by the receiver's clock, the second in which it expires must not have passed, and must be at most {wire.HORIZON_S} s ahead. A receiver without a valid clock refuses every such command.
+- A message that stores a setting must also carry a MAC made with the receiver's key, and an edition number greater than the last one stored. The edition is stored in the journal together with the setting, so a recorded message can never be replayed.
+
+Except for the MAC, these rules prevent accidents only; they do not stop a person with access to the bus. Signed frames do.
 
 ## Signed frames
 
-A bus may have a key of {signing.KEY_SIZE} bytes, which its cluster and its local controllers share ([how to](../how-to/bus-keys.md), [why so](../decisions/0027-signed-frames.md)). The cluster then signs everything of the classes *cluster* and *the authority*: version {wire.SIGNED}, and a tag of {wire.MAC_SIZE} bytes before the CRC, HMAC-SHA256 under the key of the bus over a freshness value of 8 bytes, header and payload, truncated. The freshness value is not sent:
+A bus may have a key of {signing.KEY_SIZE} bytes, which the cluster and its local controllers share ([how to](../how-to/bus-keys.md), [why](../decisions/0027-signed-frames.md)). The cluster then signs every message that the column *from* of the tables below assigns to *cluster* or *the authority*. A signed frame has version {wire.SIGNED} and a tag of {wire.MAC_SIZE} bytes before the CRC. The tag is a truncated HMAC-SHA256, with the bus key, over an 8-byte freshness value, the header and the payload. The freshness value itself is not sent:
 
 | frame | freshness value |
 |---|---|
-| SESSION to one address | the number that its local controller has drawn and told in BUS; good once |
-| SESSION to all | epoch and 32-bit count, from its payload and header |
-| any other | epoch of the last SESSION, and 32-bit count, which the receiver completes from the sequence |
+| SESSION to one address | the random number that the local controller has sent in BUS; valid once |
+| SESSION to all | the epoch and the 32-bit count, from the payload and the header of the frame |
+| any other | the epoch of the last SESSION and the 32-bit count, which the receiver reconstructs from the sequence number |
 
-- A local controller with a key refuses every unsigned frame of these classes ("wrong key"). Messages that store carry the MAC of its own key, as ever, and are not signed. DEFOCUS, STOW and questions are accepted from anyone; a question no longer counts as a sign of life of the cluster.
-- After a start, or {wire.SILENCE_MS // 1000} s without a good frame, it shows SESSION_WANTED in its STATUS. The cluster asks QUERY_BUS and sends a SESSION to its address, signed over its number. After a start it accepts no other.
-- SET_BUS_KEY carries the key added, modulo 2, to HMAC-SHA256 of the edition under the key of the local controller. It needs no session, and is taken while the mirror stands (stowed, locked, idle, defocused, in FAULT, unconfigured).
-- A local controller without a key of the bus takes signed frames and ignores their tags. Firmware that does not know them counts them as of another version and does not act.
+- A local controller with a bus key refuses unsigned frames of these two kinds ("wrong key"). Messages that store settings still carry the MAC made with the controller's own key, and are not signed. DEFOCUS, STOW and questions are accepted from anyone; a question is then no longer regarded as a sign of life of the cluster.
+- After a start, or after {wire.SILENCE_MS // 1000} s without a valid frame, the local controller sets the flag SESSION_WANTED in its STATUS. The cluster then sends QUERY_BUS, and a SESSION to the controller's address that is signed over the number from the reply. After a start, the controller accepts no other SESSION.
+- SET_BUS_KEY carries the bus key, encrypted by XOR with the HMAC-SHA256 of the edition under the key of the local controller. It needs no session, and is accepted while the mirror is at rest (stowed, locked, idle, defocused, in FAULT, or unconfigured).
+- A local controller without a bus key accepts signed frames and ignores their tags. Firmware that does not support signed frames counts them as frames of another version and does not act on them.
 """  # noqa: E501
 
 
@@ -85,8 +87,8 @@ def pages() -> dict[str, str]:
         messages.HEADS[messages.KEY],
     )
     lines.append(
-        f"Payloads from the authority begin with `{names}` (`{plain}`), with a key "
-        f"`{keyed_names}` (`{keyed}`); the table leaves this head out."
+        f"Payloads from the authority begin with `{names}` (`{plain}`), or with `{keyed_names}` "
+        f"(`{keyed}`) if they are sent with a key; the tables omit this beginning."
     )
     said = meanings()
     for number, name, who, codes, fields, _ in messages.MESSAGES:
@@ -107,7 +109,7 @@ def pages() -> dict[str, str]:
 
 
 #: Measured by ``python -m benchmarks frames``.
-DAMAGE = """Ten million frames of all types were damaged at random in five ways and read (`python -m benchmarks frames`), and ten million packets with the length and the one-byte sum of Malan's thesis, separated by silence, the best case for them. A false accept is a frame that comes out and was never sent.
+DAMAGE = """Ten million frames of all types were damaged at random in five ways and then decoded (`python -m benchmarks frames`). For comparison, the same was done with ten million packets in the format of Malan's thesis, which has a length and a one-byte sum; the packets were separated by silence, which is the best case for that format. A false accept is a decoded frame or packet that was never sent.
 
 | damage | frames | false accepts | packets | false accepts |
 |---|---|---|---|---|
@@ -117,4 +119,4 @@ DAMAGE = """Ten million frames of all types were damaged at random in five ways 
 | 1 to 12 bytes added | 2,000,954 | 0 | 2,000,746 | 0 |
 | the head of one and the tail of another | 2,000,478 | 0 | 1,998,360 | 479 (1 in 4,171) |
 
-A receiver of packets that looks at every byte, without silence, finds 38,897 of them in ten million bytes of noise. In version 2 a share of 2^-32 of heavily damaged frames passes by chance, one in four thousand million; a MAC protects stored settings."""  # noqa: E501
+A receiver that looks for packets at every byte, without separation by silence, finds 38,897 packets in ten million bytes of noise. In version 2, a fraction of 2^-32 of heavily damaged frames is accepted by chance, that is, one in four thousand million. Stored settings are additionally protected by a MAC."""  # noqa: E501

@@ -131,7 +131,9 @@ def token(
     days: Annotated[
         float,
         typer.Option(
-            min=0.001, max=365, help="Validity in days: at most 365 for a viewer, 90 above."
+            min=0.001,
+            max=365,
+            help="Validity in days: at most 365 for a viewer, 90 for a higher role.",
         ),
     ] = 30.0,
 ) -> None:
@@ -398,9 +400,12 @@ def why(
 @app.command()
 def events(
     context: typer.Context,
-    limit: Annotated[int, typer.Option(min=1, max=2000, help="Most events.")] = 50,
+    limit: Annotated[int, typer.Option(min=1, max=2000, help="Maximum number of events.")] = 50,
     all_names: Annotated[
-        bool, typer.Option("--all-names", help="The names of all heliostats of each event.")
+        bool,
+        typer.Option(
+            "--all-names", help="Print the names of all heliostats concerned by each event."
+        ),
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -1109,7 +1114,7 @@ def photographs(
     save: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the first and the last photograph of its last calibration, as JPEG.",
+            help="Folder for the first and last photograph of the last calibration, as JPEG.",
             show_default=False,
         ),
     ] = None,

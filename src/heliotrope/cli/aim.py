@@ -76,14 +76,20 @@ def aim(
         bool, typer.Option("--keep-all", help="Fail rather than defocus a heliostat.")
     ] = False,
     wanted: Annotated[
-        str, typer.Option(help="Wanted flux: uniform, or a file of the cells' (CSV). Default: any.")
+        str,
+        typer.Option(
+            help="Desired flux: uniform, or a CSV file with a value per cell. Default: any."
+        ),
     ] = "",
     give_percent: Annotated[
-        float, typer.Option(min=0, max=50, help="Power that may be given up for it, %.")
+        float,
+        typer.Option(min=0, max=50, help="Largest loss of power to reach the desired flux, %."),
     ] = 1.0,
     ramp: Annotated[
         float | None,
-        typer.Option(min=0.001, max=64000, help="Start-up: greatest rise of flux, kW/m² a minute."),
+        typer.Option(
+            min=0.001, max=64000, help="Start-up: largest rise of flux, kW/m² per minute."
+        ),
     ] = None,
     drift_mrad: Annotated[
         float,

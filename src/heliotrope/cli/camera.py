@@ -43,7 +43,8 @@ def calibrate(
         str | None, typer.Option(help="Inner corners of a chessboard, COLUMNSxROWS, e.g. 9x6.")
     ] = None,
     square: Annotated[
-        float | None, typer.Option(min=0.001, max=100, help="Side of its squares, m.")
+        float | None,
+        typer.Option(min=0.001, max=100, help="Side length of the chessboard's squares, m."),
     ] = None,
     anew: Annotated[
         bool,

@@ -23,7 +23,7 @@ def simulate(
         typer.Option(
             min=0.001,
             max=8760,
-            help="Simulated time per run; default 0.1, for a day 14 minutes.",
+            help="Simulated time per run, hours; default: 0.1, or 14 minutes with --world days.",
         ),
     ] = None,
     heliostats: Annotated[
@@ -54,7 +54,7 @@ def simulate(
     ] = None,
     results: Annotated[
         Path | None,
-        typer.Option(help="JSON file for the result: commit, worlds, seeds, checks, breaks."),
+        typer.Option(help="JSON file for the result: commit, worlds, seeds, checks, violations."),
     ] = None,
     shrink: Annotated[
         bool,

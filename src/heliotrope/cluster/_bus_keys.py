@@ -25,7 +25,8 @@ from heliotrope.lcu.signing import NO_KEY, fingerprint, pads_of, tag, wrapped
 from heliotrope.links.keys import KeyRing
 from heliotrope.safety import alarms
 
-#: Time for meeting in one second, s; the sun vector is sent after it.
+#: Time available in each second for sessions and keys of single local controllers, s; the sun
+#: vector is sent after it.
 _SHARE = 0.2
 #: A local controller that does not reply is polled again this often, then after a pause, s.
 _TRIES, _PAUSE = 3, 60.0

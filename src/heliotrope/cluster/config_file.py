@@ -39,12 +39,15 @@ class ClusterSiteTable(Table):
 
     latitude_deg: float = Field(ge=-90.0, le=90.0, description="North positive.")
     longitude_deg: float = Field(ge=-180.0, le=180.0, description="East positive.")
-    height_m: float = Field(0.0, ge=-500.0, le=9000.0, description="Above the ellipsoid.")
+    height_m: float = Field(0.0, ge=-500.0, le=9000.0, description="Height above the ellipsoid.")
     pressure_pa: float | None = Field(
-        None, ge=30e3, le=120e3, description="At the site; default from the height."
+        None,
+        ge=30e3,
+        le=120e3,
+        description="Air pressure at the site; default: computed from the height.",
     )
-    temperature_c: float = Field(12.0, ge=-80.0, le=60.0, description="Of the air.")
-    delta_t_s: float | None = Field(None, description="TT − UT1; default from the date.")
+    temperature_c: float = Field(12.0, ge=-80.0, le=60.0, description="Air temperature.")
+    delta_t_s: float | None = Field(None, description="TT − UT1; default: computed from the date.")
 
 
 class BusTable(Table):
@@ -63,7 +66,7 @@ class BusTable(Table):
         0.6,
         ge=0.001,
         le=2.0,
-        description="The same limit where flash memory is written before the reply.",
+        description="The same limit for queries whose reply follows a write to flash memory.",
     )
 
 
@@ -76,13 +79,15 @@ class PlantLinkTable(Table):
     )
     authority: str | None = Field(
         None,
-        description="PEM file of the other end's certificate authority, beside this file: "
-        "TLS for `tcp://`.",
+        description="PEM file of the authority that signed the certificate of the plant or "
+        "broker; with it, `tcp://` uses TLS.",
     )
     username: str | None = Field(
-        None, description="For the MQTT broker; its password is in the key file."
+        None, description="User name at the MQTT broker; the password is in the key file."
     )
-    unencrypted: bool = Field(False, description="Accept a plant elsewhere without TLS.")
+    unencrypted: bool = Field(
+        False, description="Accept a connection without TLS to a plant on another machine."
+    )
 
 
 class TimeTable(Table):
@@ -92,11 +97,13 @@ class TimeTable(Table):
         None,
         gt=0.0,
         le=0.5,
-        description="Bound of the clock error that you guarantee; default: ask the kernel.",
+        description="Upper bound of the clock error, guaranteed by you; default: the bound that "
+        "the kernel reports.",
     )
     gpsd: str = Field(
         "",
-        description="`host` or `host:port` of gpsd, to show the receiver and to check the clock.",
+        description="`host` or `host:port` of gpsd, to display the state of the receiver and to "
+        "check the clock.",
     )
 
 
@@ -113,10 +120,13 @@ class PollingTable(Table):
         CommonSettings.silence,
         ge=2.0,
         le=3600.0,
-        description="A heliostat silent for longer is reported.",
+        description="Time without a reply after which a heliostat is reported as silent.",
     )
     phase_s: float = Field(
-        0.0, ge=0.0, lt=1.0, description="Delay of each second after that of GPS."
+        0.0,
+        ge=0.0,
+        lt=1.0,
+        description="Delay between the GPS second and the cluster's broadcasts and queries.",
     )
 
 
@@ -127,13 +137,14 @@ class SafetyTable(Table):
         0.0,
         ge=0.0,
         le=86400.0,
-        description="Longest the plant may grant; above 0 only with a hard-wired emergency line.",
+        description="Longest autonomy that the plant may grant; above 0 only with a hard-wired "
+        "emergency line.",
     )
     emergency_line: str = Field(
-        "", description="File whose first byte is 1 while current flows in the line (GPIO)."
+        "", description="GPIO file whose first byte is 1 while current flows in the emergency line."
     )
     bus_errors: dict[str, float] = Field(
-        default_factory=dict, description="Numbers of this condition, as in the plant file."
+        default_factory=dict, description="Numbers of this safety condition, as in the plant file."
     )
     bus_failed: dict[str, float] = Field(default_factory=dict, description="The same.")
     clock_jump: dict[str, float] = Field(default_factory=dict, description="The same.")
@@ -150,8 +161,8 @@ class SafetyTable(Table):
 class MemberTable(Table):
     """``[[heliostats]]``: one table per heliostat, up to 32."""
 
-    name: str = Field(min_length=1, description="As the plant knows it.")
-    address: int = Field(ge=1, le=65534, description="On the bus.")
+    name: str = Field(min_length=1, description="Name by which the plant refers to the heliostat.")
+    address: int = Field(ge=1, le=65534, description="Address on the bus.")
     serial: int | None = Field(
         None, ge=0, le=0xFFFFFFFF, description="Serial number of its local controller."
     )
@@ -162,13 +173,15 @@ class ClusterDocument(Table):
 
     format: Literal["heliotrope-cluster"]
     version: Literal[1]
-    name: str = Field(min_length=1, description="Name of the cluster, as the plant knows it.")
-    keys: str = Field("", description="Key file, beside this one.")
+    name: str = Field(min_length=1, description="Name by which the plant refers to the cluster.")
+    keys: str = Field("", description="Path of the key file.")
     bus_key: str = Field(
-        "", description="File of the key of the bus, beside this one; default: nothing is signed."
+        "",
+        description="Path of the file with the bus key; default: frames are not signed.",
     )
     state: str = Field(
-        "", description="File for epoch and editions, beside this one; default NAME.state.json."
+        "",
+        description="Path of the file for the epoch and the editions; default: NAME.state.json.",
     )
     site: ClusterSiteTable
     bus: BusTable

@@ -14,7 +14,8 @@ if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such mo
 
 #: Largest coordinate (m) or step count.
 FAR, MOST_STEPS = 1e5, 1 << 29
-#: A defocus of less than this (rad) on both axes would leave the beam on the receiver.
+#: Limits of the larger of the two defocus angles, rad. A smaller turn than the first limit would
+#: leave the beam on the receiver.
 LEAST_DEFOCUS, MOST_DEFOCUS = 0.02, 1.6
 #: Points that fit in the item "way".
 MOST_POINTS = 4

@@ -47,7 +47,7 @@ if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such mo
 
 (SEGMENT, ANSWER, STORE, RECALL, BEFORE_STEPS, AT_REST, NOTE, ZEROED, FEED, DRIVERS) = range(10)
 
-#: Faults; their texts, and the names of the flag bits, are in ``names``.
+#: Fault codes; their texts, and the names of the flag bits, are in ``names``.
 (
     NO_FAULT,
     STUCK_PRIMARY,

@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such mo
 #: Angle by which an axis is moved, and smallest change of tilt that the sensor detects, rad.
 NUDGE, NOTICED = 0.02, 0.002
 
-#: Result bits.
+#: Bits in the result of a diagnosis.
 MOVED_PRIMARY, MOVED_SECONDARY, STUCK_PRIMARY, STUCK_SECONDARY, NO_SENSOR = 1, 2, 4, 8, 16
 
 

@@ -13,7 +13,7 @@ from .vectors import finite
 
 ROTARY, JACK_RISING, JACK_FALLING = 0, 1, 2
 
-#: Indices of the ten parameters.
+#: Indices of the ten parameters of a drive.
 ZERO, RATE, STROKE, OFFSET, RADIUS, SCALE, WORM_COS, WORM_SIN, WORM_RATIO, SAG = range(10)
 
 

@@ -230,7 +230,7 @@ def fields_of(number: int) -> list[str]:
     return (head + " " + row[4]).split()
 
 
-#: Results in ACK.
+#: Result codes in ACK.
 (
     DONE,
     REFUSED_STATE,

@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # for the type checker only; a microcontroller has no such mo
 
     from .diagnosis import Diagnosis
 
-#: Motions.
+#: Codes of the motions.
 HOLD, MOVE, DEFOCUS, APPROACH, RETURN, STOW, STANDBY, TRACK, SEARCH, DIAGNOSE = range(10)
 
 #: Interval at which goals are renewed, ms; and interval at which poses are computed, ms. Between

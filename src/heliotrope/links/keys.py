@@ -26,7 +26,7 @@ from heliotrope.files.documents import read_toml
 
 _SHORTEST_KEY, _LONGEST_KEY = 16, 64
 _SIZE = 32
-#: The new key and the previous one.
+#: Maximum number of keys of a link: the new key and the previous one.
 _MOST = 2
 _OTHERS = 0o077
 #: Tables of keys in a plant's file, and in a cluster's file.

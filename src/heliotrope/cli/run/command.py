@@ -98,8 +98,8 @@ def run(
         typer.Option(
             "--from",
             help="second-day: the field tracks, and part of it was measured the day "
-            "before; new: no heliostat has been measured; stow: as second-day, but in "
-            "the morning at stow.",
+            "before; new: no heliostat has been measured; stow: as second-day, but "
+            "beginning in the morning with the field at stow.",
             rich_help_panel=_TWIN,
         ),
     ] = Begin.SECOND_DAY,
@@ -231,7 +231,7 @@ def run(
         typer.Option(
             min=3,
             max=100,
-            help="Failed sign-ins in an hour, for one name at one address, after which it waits.",
+            help="Failed sign-ins per hour for one name at one address; more attempts must wait.",
             rich_help_panel=_CONSOLE,
         ),
     ] = 12,

@@ -32,7 +32,8 @@ from heliotrope.plant.orders.authority import Person, RefusedError
 from heliotrope.plant.orders.queue import RECORDING
 from heliotrope.plant.orders.tickets import Ticket
 
-#: For this long, an emergency order with the identifier of an earlier one counts as that order, s.
+#: Time for which an emergency order with the identifier of an earlier one is treated as the same
+#: order, s; and maximum number of identifiers that are remembered.
 SAME, _MOST_CALLED = 30.0, 100
 #: A holder of the authority counts as present for this long after renewing it, s.
 PRESENT = 8.0

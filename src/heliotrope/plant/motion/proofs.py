@@ -36,7 +36,7 @@ _MOVES = 200
 #: Commands whose whole motion is proven clear before they are sent.
 _PROVEN = messages.TO_STANDBY | messages.BY_COUNTS
 #: States from which IDLE moves a heliostat straight to its standby point. From the last two it does
-#: so once the heliostat has been unlocked, or its fault cleared, which no report may show yet.
+#: so once the heliostat has been unlocked, or its fault cleared, which a report may not show yet.
 _TO_STANDBY = (
     states.TRACKING,
     states.SEARCHING,

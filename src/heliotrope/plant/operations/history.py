@@ -17,7 +17,7 @@ from heliotrope.store.records import PlantFigures, Records, StoreError
 
 #: Time between two records of figures, s.
 EVERY = 60.0
-#: Significant digits stored of a figure.
+#: Number of significant digits with which a figure is stored.
 _DIGITS = 5
 #: Unit of each kind of figure; readings have the units of the safety table.
 UNITS = {
