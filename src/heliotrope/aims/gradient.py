@@ -85,9 +85,9 @@ def _uphill(engine: FieldFlux, place: FloatArray, worth: FloatArray) -> FloatArr
     ray = reflect(np.broadcast_to(scene.sun, mirrors.normal.shape), mirrors.normal)
     right = normalize(np.stack([ray[:, 1], -ray[:, 0], 0.0 * ray[:, 0]], axis=-1))
     axes = np.stack([right, np.cross(right, ray)], axis=1)
-    ways = [
+    differences = [
         on_receiver(scene, place + s * step) - on_receiver(scene, place - s * step)
         for s in np.eye(2)
     ]
-    turned = np.einsum("hkx,mhx->hmk", axes, np.stack(ways)) / (2.0 * step)
+    turned = np.einsum("hkx,mhx->hmk", axes, np.stack(differences)) / (2.0 * step)
     return as_float(np.einsum("hmk,hk->hm", turned, slope) / mirrors.slant[:, None])

@@ -50,12 +50,12 @@ def read_points(path: str | Path, names: Sequence[str] = ()) -> dict[str, FloatA
         find_heliostats(rows, "heliostat", names)
     else:
         rows.heliostat = rows.texts("heliostat")
-    found = np.stack(
+    values = np.stack(
         [rows.numbers(column, "a number in m") for column in POINT_COLUMNS[1:]], axis=-1
     )
     rows.refuse_bad()
-    points = dict(zip(rows.heliostat, found, strict=True))
-    if not points or len(points) < len(found):
+    points = dict(zip(rows.heliostat, values, strict=True))
+    if not points or len(points) < len(values):
         problem = "names a heliostat twice" if points else "has no rows"
         raise InputError(f"{path}: the table {problem}; give each heliostat one row")
     return points

@@ -74,8 +74,8 @@ def _most(beam, x, y, z, half, sun):
     if far <= 0.0 or near > far:
         return 0.0
     square = u * u + v * v + w * w - along * along
-    one, two = 1.0 - near * beam[7], 1.0 - far * beam[7]
-    wide = max(abs(one), abs(two), _LEAST_GAP)
+    gap_near, gap_far = 1.0 - near * beam[7], 1.0 - far * beam[7]
+    wide = max(abs(gap_near), abs(gap_far), _LEAST_GAP)
     reach = beam[6] * wide + far * sun + 1.7320509 * half
     if square >= reach * reach:
         return 0.0
@@ -86,7 +86,9 @@ def _most(beam, x, y, z, half, sun):
         off -= half * (abs(u) + abs(v) + abs(w)) / off
         if off >= beam[6] * wide + far * sun:
             return 0.0
-    thin = _LEAST_GAP if one * two <= 0.0 else max(min(abs(one), abs(two)), _LEAST_GAP)
+    thin = _LEAST_GAP
+    if gap_near * gap_far > 0.0:
+        thin = max(min(abs(gap_near), abs(gap_far)), _LEAST_GAP)
     if near <= 0.0:
         return beam[9] / (thin * thin)
     disk = near * sun
@@ -99,13 +101,13 @@ def _most(beam, x, y, z, half, sun):
 
 
 @njit(**OPTIONS)
-def light_at(beams, points, sun, found):
-    """Write the light of all beams (N, BEAM) at points (P, 3), in suns, to found (P,)."""
+def light_at(beams, points, sun, light):
+    """Write the light of all beams (N, BEAM) at points (P, 3), in suns, to light (P,)."""
     for k in range(len(points)):
         total = 0.0
         for i in range(len(beams)):
             total += _light(beams[i], points[k, 0], points[k, 1], points[k, 2], sun)
-        found[k] = total
+        light[k] = total
 
 
 @njit(**INNER)
@@ -210,10 +212,10 @@ def strongest(beams, low, middle, half, sun, share, least, work, enough, best):
             bound, end = _reached(beams, pool, first, last, begin, child, sun)
             work -= last - first
             if bound > best[3] and child[2] > low:
-                here = _sum(beams, pool, begin, end, child[0], child[1], child[2], sun)
+                light = _sum(beams, pool, begin, end, child[0], child[1], child[2], sun)
                 work -= end - begin
-                if here > best[3]:
-                    best[0], best[1], best[2], best[3] = child[0], child[1], child[2], here
+                if light > best[3]:
+                    best[0], best[1], best[2], best[3] = child[0], child[1], child[2], light
             if bound <= best[3] * (1.0 + share):
                 most, end = max(most, bound), begin
                 continue
@@ -231,21 +233,21 @@ def reach(beams, low, middle, half, sun, limit, least):
     """
     pool, stack = _begin(beams, middle, half)
     cube, child = np.empty(_CUBE), np.empty(4)
-    height, found = 1, 0.0
+    height, distance = 1, 0.0
     while height > 0:
         height -= 1
         for m in range(_CUBE):
             cube[m] = stack[height, m]
         first, last, bottom, end = int(cube[5]), int(cube[6]), height, int(cube[7])
-        if cube[4] <= found:
+        if cube[4] <= distance:
             continue
         if 0.5 * cube[3] < least:
-            found = cube[4]
+            distance = cube[4]
             continue
         for corner in range(8):
             _octant(cube, corner, child)
             away = _farthest(child, middle)
-            if child[2] + child[3] <= low or away <= found:
+            if child[2] + child[3] <= low or away <= distance:
                 continue
             begin = end
             bound, end = _reached(beams, pool, first, last, begin, child, sun)
@@ -255,4 +257,4 @@ def reach(beams, low, middle, half, sun, limit, least):
             _put(stack, height, child, away, begin, end)
             height += 1
         _sort(stack, bottom, height, end)
-    return found
+    return distance

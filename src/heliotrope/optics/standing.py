@@ -49,7 +49,7 @@ def suns_of_the_year(latitude: float) -> FloatArray:
 def hours_of_the_year(
     latitude: float, days: int = 24, every: float = 0.5
 ) -> tuple[FloatArray, FloatArray]:
-    """Return sun positions of the year, (S, 3), and the daylight hours each stands for, (S,).
+    """Return sun positions of the year, (S, 3), and the daylight hours that each represents, (S,).
 
     Parameters
     ----------

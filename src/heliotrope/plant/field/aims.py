@@ -506,7 +506,7 @@ class BeamCheck:
     def at_rest(
         self, rows: npt.NDArray[np.intp], points: FloatArray, sun: FloatArray
     ) -> npt.NDArray[np.bool_]:
-        """Return which heliostats may rest with their beams at points.
+        """Return a mask of the heliostats that may rest with their beams at points.
 
         The heliostats must reach the points, and the beams must not enter receivers, targets or
         keep-out volumes on their way to the points or beyond.

@@ -132,8 +132,8 @@ class StandbyField:
         self.today = as_float(points)
         self._vertex = self.check.armature.origin_1
         self._rows, self._paths = np.arange(len(design)), Paths(self.check)
-        given = default_aims(design, design.names, self._vertex, None)
-        self._aims = np.stack(list(given.values()))
+        aims = default_aims(design, design.names, self._vertex, None)
+        self._aims = np.stack(list(aims.values()))
         self._around = float(np.linalg.norm(self._vertex - self.center, axis=-1).max())
 
     def rest(self, points: FloatArray) -> Rest:
@@ -199,8 +199,8 @@ class StandbyField:
         shape = (len(self.suns), len(eyes))
         hazard, light = np.zeros(shape, dtype=np.int8), np.zeros(shape)
         for k, sun in enumerate(self.suns):
-            found = glare_at(self._beams(points, sun), eyes)
-            hazard[k], light[k] = found.hazard, found.corneal / NOMINAL_DNI
+            glare = glare_at(self._beams(points, sun), eyes)
+            hazard[k], light[k] = glare.hazard, glare.corneal / NOMINAL_DNI
             if progress is not None:
                 progress(k + 1, len(self.suns))
         years = []
@@ -233,22 +233,22 @@ class StandbyField:
         slant = np.linalg.norm(self._vertex - self.center, axis=-1)
         place = np.empty(len(slant), dtype=np.intp)
         place[np.argsort(slant, kind="stable")] = np.arange(len(slant))
-        points, left = np.empty_like(self.today), self._rows
+        points, remaining = np.empty_like(self.today), self._rows
         following = len(slant)
         for trial in range(_TRIES):
             # Something may stand in the whole sector; the other side is free then.
-            here = side if trial < _TRIES // 2 else -side
-            points[left] = self._sector(left, place[left], here, size)
-            clear = [self.check.at_rest(left, points[left], sun) for sun in self.suns]
-            left = left[~np.all(clear, axis=0)]
-            if not len(left):
+            tried = side if trial < _TRIES // 2 else -side
+            points[remaining] = self._sector(remaining, place[remaining], tried, size)
+            clear = [self.check.at_rest(remaining, points[remaining], sun) for sun in self.suns]
+            remaining = remaining[~np.all(clear, axis=0)]
+            if not len(remaining):
                 return points
-            place[left] = following + np.arange(len(left))
-            following += len(left)
+            place[remaining] = following + np.arange(len(remaining))
+            following += len(remaining)
         raise InputError(
-            f"standby: {len(left)} heliostats, the first {self.check.names[left[0]]}, find no "
-            f"point within {self._inner + size:.0f} m of the receiver from which no beam enters a "
-            "receiver, a target or a keep-out volume; move their standby_m, or these volumes"
+            f"standby: {len(remaining)} heliostats, the first {self.check.names[remaining[0]]}, "
+            f"find no point within {self._inner + size:.0f} m of the receiver from which no beam "
+            "enters a receiver, a target or a keep-out volume; move their standby_m, or these volumes"
         )
 
     @property

@@ -99,8 +99,8 @@ class FluxObserver(Judge):
         """
         forget()
 
-        async def noting(work: Callable[[*Given], T], *given: *Given) -> T:
-            answer = await at_once(work, *given)
+        async def noting(work: Callable[[*Given], T], *arguments: *Given) -> T:
+            answer = await at_once(work, *arguments)
             if isinstance(answer, Answer):
                 for move in answer.moves:
                     self.aimed({names[k]: p for k, p in zip(move.rows, move.aims, strict=True)})

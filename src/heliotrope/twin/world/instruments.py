@@ -135,8 +135,8 @@ class Sky:
     def dni(self) -> float:
         """Return the present irradiance, W/m²."""
         now = self._clock.monotonic()
-        left = [share for begin, end, share in self._clouds if begin <= now < end]
-        return self.clear * min(left, default=1.0)
+        shares = [share for begin, end, share in self._clouds if begin <= now < end]
+        return self.clear * min(shares, default=1.0)
 
     async def run(self) -> None:
         """Send the irradiance to the plant every second, until cancelled."""
