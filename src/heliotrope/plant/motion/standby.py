@@ -248,7 +248,8 @@ class StandbyField:
         raise InputError(
             f"standby: {len(remaining)} heliostats, the first {self.check.names[remaining[0]]}, "
             f"find no point within {self._inner + size:.0f} m of the receiver from which no beam "
-            "enters a receiver, a target or a keep-out volume; move their standby_m, or these volumes"
+            "enters a receiver, a target or a keep-out volume; move their standby_m, or these "
+            "volumes"
         )
 
     @property
