@@ -377,10 +377,19 @@ def test_before_the_night_the_field_leaves_along_the_ramp(
             monkeypatch.setattr(
                 aiming.Aiming, "_before_night", lambda self: end - self._plant.now()
             )
-            seen = [await greatest(made, every) for _ in range(6)]
-            assert seen[0] > 1.5 * ramp
-            assert np.diff(seen).min() >= -1.4 * ramp, seen
-            assert seen[-1] <= 0.5 * ramp, seen
+            steady, rate = await greatest(made, 3.0), ramp / every
+            assert steady > 1.5 * ramp
+            seen: list[tuple[float, float]] = []
+            while made.plant.now() < end + every:
+                await asyncio.sleep(1.0)
+                seen.append((end - made.plant.now(), float(true_flux(made).max())))
+            for remaining, flux in seen:
+                # Each round brings the flux under the line of that moment, until the next one.
+                assert flux <= rate * (max(remaining, 0.0) + every) + 1e3, seen
+                if remaining > steady / rate + 3.0:
+                    assert flux > 0.85 * steady, "no beam leaves before it must"
+            assert any(0.2 * steady < flux < 0.7 * steady for _, flux in seen), "in steps"
+            assert seen[-1][1] == 0.0
 
     played(scene, sensors=(DNI_READING,), ramp=ramp / every)
 
