@@ -16,7 +16,7 @@ from support.pages import NEEDS_BROWSER
 
 VIEW = AimsView(
     "limit", "last good aims", 42.0, 570e3, 551e3, 0.033, 17, 161e3, 166e3, 0.002, 5, 1, 2,
-    ("P0001A", "P0002A"), 12.0, "no answer within 60 s",
+    ("P0003A",), ("P0001A", "P0002A"), 12.0, "no answer within 60 s",
 )  # fmt: skip
 
 
@@ -43,7 +43,7 @@ def test_the_page_shows_limit_flux_and_who_moved(limited: None, enter: Callable[
     shown = " ".join(page.locator("body").inner_text().split())
     for text in (
         "no answer within 60 s", "last good aims", "570, 551 kW/m²", "3.3 %", "17",
-        "161, 166 kW", "5, 1, 2", "P0001A, P0002A",
+        "161, 166 kW", "5, 1, 2", "Reach no cell 1: P0003A", "P0001A, P0002A",
     ):  # fmt: skip
         assert text in shown, text
     assert page.evaluate("document.documentElement.scrollWidth") <= 820
@@ -85,6 +85,7 @@ def test_ctl_prints_what_the_page_shows(limited: None, ctl: Callable[..., str]) 
             "5 heliostats have an aim, 1 are off the receiver because of the limit, "
             "2 still have to move"
         ),
+        "1 reach no cell of the receiver: P0003A",
         "2 moved 12 s ago: P0001A, P0002A",
     ]
     told = json.loads(ctl("--json"))

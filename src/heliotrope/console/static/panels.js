@@ -104,6 +104,7 @@ function aimsView(aims) {
     [t("Left of the limit"), share(aims.reserve)], [t("Cells at the limit"), count(aims.binding)],
     [t("Power, and of the best aims"), `${kilowatts(aims.power)}, ${kilowatts(aims.planned)} kW`],
     [t("With an aim, at rest for the limit, still to move"), `${count(aims.aimed)}, ${count(aims.resting)}, ${count(aims.left)}`],
+    ...(aims.unlit.length ? [[t("Reach no cell"), `${count(aims.unlit.length)}: ${aims.unlit.slice(0, 5).join(", ")}`]] : []),
     [t("Moved last"), aims.moved.length ? t("{n}, {ago} ago: {names}", { n: count(aims.moved.length), ago: span(aims.moved_ago), names: aims.moved.slice(0, 5).join(", ") }) : t("none")]])];
 }
 
