@@ -237,9 +237,10 @@ class LiveConsole:
         return self.call(lambda: dict(self.live.operations.summary().states))
 
     def produced(self) -> bool:
-        """Whether figures are kept in which a receiver gets power."""
+        """Whether two figures are kept in which a receiver gets power."""
         rows = self.keeper.figures(0.0, 1e11)
-        return any(v > 0.0 for row in rows for name, v in row.values.items() if "power" in name)
+        powers = (v for row in rows for name, v in row.values.items() if "power" in name)
+        return sum(v > 0.0 for v in powers) > 1
 
     def release(self) -> None:
         """Release the command authority, whoever holds it: a failed test keeps nothing."""
