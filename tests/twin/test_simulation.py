@@ -26,7 +26,7 @@ from heliotrope.twin.world.scene import scene_of
 from heliotrope.twin.world.simulation import RunPlan, RunResult, run, shrink
 from heliotrope.twin.world.soak import SoakResult
 from heliotrope.twin.world.tour import TOUR_LENGTH
-from heliotrope.twin.world.worlds import DAYS, MIX, RARE, REPAIRS, WORLDS, mixed
+from heliotrope.twin.world.worlds import DAYS, LIMIT, MIX, RARE, REPAIRS, WORLDS, mixed
 from support.twin_defects import DEFECTS, Defect
 
 ROOT = Path(__file__).parents[2]
@@ -219,7 +219,7 @@ def test_each_run_of_any_draws_its_worlds_again() -> None:
     drawn = [mixed(seed) for seed in range(200)]
     assert drawn == [mixed(seed) for seed in range(200)]
     assert () in drawn
-    assert {name for worlds in drawn for name in worlds} == {*MIX, *RARE, DAYS, REPAIRS}
+    assert {name for worlds in drawn for name in worlds} == {*MIX, *RARE, DAYS, REPAIRS, LIMIT}
     for name in RARE:
         assert sum(name in worlds for worlds in drawn) < 20
     assert not any({"twice", "lights"} <= set(worlds) for worlds in drawn)
