@@ -215,6 +215,8 @@ def judged(seen: Seen, minutes: float) -> dict[str, float]:
         steady = float(np.median(clear[(at > begin - 2.0) & (at < begin)]))
         if (later := clear[at > end + 4.0]).size:
             steady = min(steady, float(later[0]))  # without those that were lost
+        if steady <= 0.0:
+            raise BenchmarkError(f"the field left after the cloud of minute {begin:g}")
         within = (at > end) & (at <= end + BACK / 60.0)
         back.append(float(power[within][-1] / steady))
         span = (at > begin) & (at <= end + 4.0)
