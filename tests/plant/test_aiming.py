@@ -23,7 +23,7 @@ from heliotrope.optics.surfaces import surface_of
 from heliotrope.plant.emergency import DNI_READING
 from heliotrope.plant.operations import aiming
 from heliotrope.plant.operations.automatic import AutomaticSettings
-from heliotrope.plant.orders.authority import Person, Role
+from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.workers import at_once
 from heliotrope.twin.sensors import FluxSensor
@@ -343,6 +343,28 @@ def test_the_receiver_is_heated_in_steps_at_the_start_and_after_a_cloud() -> Non
             back = await watched(120.0)
             assert np.diff([cloud[-1], *back]).max() <= 1.3 * ramp
             assert back[-1] > 0.9 * up[-1]
+
+    played(scene, sensors=(DNI_READING,), ramp=ramp / every)
+
+
+def test_beams_leave_the_receiver_where_new_motions_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As after many failures: the sun may come back at any time."""
+    ramp, every = 30e3, 15.0
+
+    def refuse(heliostats: object) -> None:
+        raise RefusedError("IDLE: not accepted now: new motions of the field are refused")
+
+    async def scene(made: LivePlant) -> None:
+        sky = Sky(made)
+        async with sky.shining():
+            await asyncio.sleep(130.0)
+            assert await greatest(made, 3.0) > 1.5 * ramp
+            monkeypatch.setattr(made.operations.automatic, "rest", refuse)
+            sky.dni = 20.0
+            await asyncio.sleep(135.0)
+            assert float(true_flux(made).max()) <= 1.3 * ramp, "what the sun would bring at once"
 
     played(scene, sensors=(DNI_READING,), ramp=ramp / every)
 

@@ -43,6 +43,7 @@ from heliotrope.plant.field.state import OUT_OF_ORDER
 from heliotrope.plant.operations.automatic import AutomaticControl
 from heliotrope.plant.operations.flux_check import Beyond, FluxCheck
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.workers import Worker
 from heliotrope.safety import alarms
 from heliotrope.store.records import Records, StoreError
@@ -520,12 +521,19 @@ class Aiming:
         return not refused
 
     async def _rest(self, rows: npt.NDArray[np.intp]) -> bool:
-        """Send beams to standby; return whether the order was accepted."""
+        """Take beams off the receiver; return whether the order was accepted.
+
+        They go to standby, or turn away where new motions are refused, as after many failures:
+        a limit must hold then too.
+        """
         names = tuple(self._plant.field.names[row] for row in rows)
         if not names:
             return True
         try:
-            ticket = self._automatic.rest(names)
+            try:
+                ticket = self._automatic.rest(names)
+            except RefusedError:
+                ticket = self._automatic.turn_away(names)
         except HeliotropeError as error:
             self._block(getattr(error, "refusals", dict.fromkeys(names, str(error))))
             return False

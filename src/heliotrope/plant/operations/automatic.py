@@ -578,6 +578,10 @@ class AutomaticControl:
         """Send heliostats to standby; they stay wanted."""
         return self._plant.command(AUTOMATIC, self._token, "IDLE", heliostats)
 
+    def turn_away(self, heliostats: Sequence[str]) -> Ticket:
+        """Defocus heliostats; they stay wanted."""
+        return self._plant.command(AUTOMATIC, self._token, "DEFOCUS", heliostats)
+
     # -- views -----------------------------------------------------------------------------
 
     def view(self) -> CalibrationView:
