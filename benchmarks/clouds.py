@@ -173,7 +173,6 @@ async def live_through(count: int, minutes: float, case: str) -> tuple[Seen, flo
     work = AutomaticSettings(
         wanted=True,
         calibrate=False,
-        rate=20.0,
         losses=count,
         losses_share=1.0,
         margin=0.0,

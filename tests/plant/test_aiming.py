@@ -57,7 +57,7 @@ def played(
     group = replace(design.groups[name], cluster=("C1",) * half + ("C2",) * half)
     settings: dict[str, object] = {"probability": 0.95, "moves": 60.0, "every": 15.0}
     aims = AimSettings("limit", FluxLimit(limit, 0.05), **(settings | changes))  # type: ignore[arg-type]
-    work_settings = AutomaticSettings(wanted=True, calibrate=False, rate=5.0)
+    work_settings = AutomaticSettings(wanted=True, calibrate=False)
     plant = PlantSettings(sensors=frozenset(sensors))
     options = LiveOptions(
         rendered=False, threads=0, work=work_settings, installed=exact, plant=plant

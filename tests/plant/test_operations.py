@@ -982,8 +982,8 @@ def test_the_work_survives_a_camera_that_fails() -> None:
 
 
 def test_work_settings_that_are_none() -> None:
-    with pytest.raises(InputError, match="heliostats per second, a cycle of"):
-        AutomaticSettings(rate=0.0)
+    with pytest.raises(InputError, match="a cycle of 0.0 s"):
+        AutomaticSettings(beat=0.0)
     with pytest.raises(InputError, match="losses must be 0 or more, not -1"):
         AutomaticSettings(losses=-1)
     with pytest.raises(InputError, match=r"losses_share must be between 0 and 1, not 1\.5"):

@@ -205,7 +205,7 @@ def test_a_store_keeps_the_day_once(tmp_path: Path) -> None:
 
 def test_a_plant_takes_yesterday_over_and_goes_on_with_other_heliostats(tmp_path: Path) -> None:
     design = malan_plant(24)
-    work = AutomaticSettings(wanted=True, rate=50.0)
+    work = AutomaticSettings(wanted=True)
     options = LiveOptions(rendered=False, threads=0, together=True, work=work)
 
     async def main(clock: VirtualClock) -> None:

@@ -156,6 +156,8 @@ class PlantController:
         The last alarms, oldest first.
     name
         Name of this plant run: UTC of its start, and random digits.
+    join_rate
+        Number of heliostats that may join the receiver per second.
     lockouts
         Personal locks; EMERGENCY, DEFOCUS and STOW override them.
     aims, standbys
@@ -211,9 +213,8 @@ class PlantController:
         self.movements.recall(points.held["LENT"])
         self._agreement = self._compared(points)
         self._clusters = Clusters(members, links, clock, self.counters)
-        self._joining = JoinQueue(
-            self.settings.join_rate, self.settings.join_burst, self.settings.join_wait
-        )
+        self.join_rate, burst = self.settings.joins(design)
+        self._joining = JoinQueue(self.join_rate, burst, self.settings.join_wait)
         self._identities = Identities(
             self.field,
             self.beams.armature.table,

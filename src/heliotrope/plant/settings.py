@@ -9,6 +9,9 @@ from heliotrope.field.plant import Plant
 from heliotrope.links.common_settings import CommonSettings
 from heliotrope.plant.field.state import STALE
 
+#: Number of heliostats that may join the receiver per second without a flux ramp.
+JOIN_RATE = 10.0
+
 
 @dataclass(frozen=True)
 class PlantSettings:
@@ -23,7 +26,7 @@ class PlantSettings:
         Interval between leases; interval between evaluations of the safety table and the queues, s.
     join_rate, join_burst
         Number of heliostats that may join the receiver per second, and number that may join at once
-        after a pause.
+        after a pause; None: see `joins`.
     join_wait
         Maximum time that a heliostat may wait to join, s.
     join_life
@@ -64,8 +67,8 @@ class PlantSettings:
     autonomy: float = 0.0
     period: float = 1.0
     beat: float = 0.25
-    join_rate: float = 10.0
-    join_burst: int = 10
+    join_rate: float | None = None
+    join_burst: int | None = None
     join_wait: float = 1800.0
     join_life: float = 3.0
     lifetime: float = 10.0
@@ -97,6 +100,20 @@ class PlantSettings:
                 f"plant: a cycle of {self.beat} s and a repetition of {self.repeat} s; the ranges "
                 "are above 0 to 1 s, and above 0"
             )
+
+    def joins(self, design: Plant) -> tuple[float, int]:
+        """Return how many heliostats may join the receiver per second, and at once after a pause.
+
+        Unless the settings say otherwise, `JOIN_RATE` per second, whatever the size of the field,
+        because each adds flux. Under a flux ramp, which bounds that flux itself, the number is that
+        of the drives which may start together: ``stow_rate``. After a pause, those of one second
+        may join at once.
+        """
+        rate = self.join_rate
+        if rate is None:
+            together = self.stow_rate or float(sum(len(g.names) for g in design.groups.values()))
+            rate = together if design.aims.ramp > 0.0 else JOIN_RATE
+        return rate, max(1, round(rate)) if self.join_burst is None else self.join_burst
 
 
 @dataclass

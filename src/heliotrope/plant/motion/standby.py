@@ -23,7 +23,7 @@ from heliotrope.optics.glare import Hazard, glare_at
 from heliotrope.optics.standing import Hottest, hottest, stays_below
 from heliotrope.plant.field.aims import BeamCheck, default_aims, point_text
 from heliotrope.plant.motion.paths import Paths
-from heliotrope.plant.settings import PlantSettings
+from heliotrope.plant.settings import JOIN_RATE
 
 Rows = npt.NDArray[np.intp]
 
@@ -322,8 +322,7 @@ class StandbyField:
 def _returned(moves: FloatArray) -> float:
     """Return when the last of N heliostats is back, s, if their moves last (N,) s.
 
-    They join in order, at the rate of the plant's settings.
+    They join in order, at the rate of a plant without a flux ramp.
     """
-    rate = PlantSettings()
-    turn = np.maximum(np.arange(1, len(moves) + 1) - rate.join_burst, 0) / rate.join_rate
+    turn = np.maximum(np.arange(1, len(moves) + 1) - JOIN_RATE, 0.0) / JOIN_RATE
     return float((turn + moves).max())

@@ -107,9 +107,6 @@ class AutomaticSettings:
         `give_back`.
     calibrate
         Whether calibration is switched on at the start.
-    rate
-        Number of heliostats that leave stow per second; the same number may go to the receiver per
-        second.
     beat
         Time between checks of the field, s.
     lowest
@@ -132,7 +129,6 @@ class AutomaticSettings:
 
     wanted: bool = False
     calibrate: bool = True
-    rate: float = 10.0
     beat: float = 2.0
     lowest: float = math.radians(8.0)
     patience: float = 60.0
@@ -143,11 +139,10 @@ class AutomaticSettings:
     events: float = 400.0
 
     def __post_init__(self) -> None:
-        if not (0.0 < self.rate <= 100.0 and 0.0 < self.beat <= 60.0 and self.margin >= 0.0):
+        if not (0.0 < self.beat <= 60.0 and self.margin >= 0.0):
             raise InputError(
-                f"automatic control: {self.rate} heliostats per second, a cycle of {self.beat} s, "
-                f"a margin of {self.margin}; the ranges are above 0 to 100, above 0 to 60 s, and 0 "
-                f"or more"
+                f"automatic control: a cycle of {self.beat} s, a margin of {self.margin}; the "
+                "ranges are above 0 to 60 s, and 0 or more"
             )
         if self.losses < 0:
             raise InputError(f"automatic control: losses must be 0 or more, not {self.losses}")
@@ -233,7 +228,7 @@ class AutomaticControl:
             plant,
             logbook,
             AUTOMATIC,
-            most=max(1, round(settings.rate * settings.beat)),
+            most=max(1, round(plant.join_rate * settings.beat)),
             patience=settings.patience,
             clearance=settings.margin * self.installed,
             wanted=settings.wanted,
@@ -370,7 +365,7 @@ class AutomaticControl:
     @property
     def follows_within(self) -> float:
         """Time within which all heliostats under automatic control must follow, s."""
-        return _FOLLOWS + len(self._plant.field) / self._settings.rate
+        return _FOLLOWS + len(self._plant.field) / self._plant.join_rate
 
     def following(self, since: float, heliostats: Sequence[str]) -> Mapping[str, Step]:
         """Return whether heliostats follow automatic control, or why not.

@@ -400,7 +400,8 @@ class PlantObserver(Judge):
         Commands that leave when the plant resumes after a freeze may have been admitted earlier, by
         up to a command's lifetime. This applies both to the beginning and to the end of a period.
         """
-        rate, burst = self._settings.join_rate, self._settings.join_burst
+        # A simulation gives both numbers.
+        rate, burst = self._settings.join_rate or 0.0, self._settings.join_burst or 0
         life = self._settings.join_life
         count = 0
         for at, some in reversed(joined):

@@ -41,7 +41,7 @@ from heliotrope.twin.world.photographs import LyingCamera
 #: two.
 LOSSES = 1
 #: Settings with short pauses before orders are repeated.
-SETTINGS = AutomaticSettings(rate=1.0, losses=LOSSES, patience=20.0)
+SETTINGS = AutomaticSettings(losses=LOSSES, patience=20.0)
 #: Settings of a visit that fits into a run of some minutes.
 VISIT = CycleSettings(shots=3, interval=2.0, arrival=60.0, least=3, model=CYCLE.model)
 #: Settings of a search that stays near its target.
