@@ -59,7 +59,7 @@ burst + rate · T in any span of T seconds.
 
 ## What the table does not do
 
-The table is evaluated by software on ordinary computers. It has no safety integrity level (SIL).
+The table is evaluated by software that has no safety integrity level (SIL), on ordinary computers.
 The receiver's own protection and the emergency line must not depend on it. The limits have not been
 tried on a real plant.
 """
