@@ -31,18 +31,19 @@ KINDS = {
 }
 
 #: Said below the table of models.
-ROLES = """The table lists `malan8`, `guo6` and `khalsa8` for azimuth-elevation mechanisms. For another kind of
-mechanism, these models consist of the parameters of that kind with the same roles. The roles are
-`position`, `tilts`, `biases`, `scales`, `non_orthogonality` and `canting`. To define a model of your
-own, join models, roles and parameters by `+`: `malan8+canting`, `tilts+biases+sag`."""
+ROLES = """The table lists `malan8`, `guo6` and `khalsa8` for azimuth-elevation mechanisms. For
+another kind of mechanism, these models consist of the parameters of that kind with the same roles.
+The roles are `position`, `tilts`, `biases`, `scales`, `non_orthogonality` and `canting`. To define
+a model of your own, join models, roles and parameters by `+`: `malan8+canting`,
+`tilts+biases+sag`."""
 
 
 def pages() -> dict[str, str]:
     """Return the page's text, by path."""
     said = (
         "Each parameter is a deviation from the nominal mechanism. This page is generated from the "
-        "table in the program (`python -m scripts.pages`). The two tables are for the two "
-        "kinds named in their headings. Other kinds of mechanism have the same parameters, but the names "
+        "table in the program (`python -m scripts.pages`). The two tables are for the two kinds "
+        "named in their headings. Other kinds of mechanism have the same parameters, but the names "
         "of drive parameters begin with the names of their own joints."
     )
     lines = ["# Parameters of a mechanism", "", said]
