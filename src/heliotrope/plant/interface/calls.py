@@ -747,7 +747,7 @@ async def put_plant_file(desk: Desk, who: Person, order: orders.PlantFileOrder) 
 
 @_call("POST plant-file/waiting/{number}/approve", "plant file", ENGINEER)
 async def approve_plant_file(desk: Desk, who: Person, order: orders.OneChange) -> PlantFileStored:
-    """Approve another engineer's text, which is then stored; if that fails, it continues to wait."""
+    """Approve another engineer's text, which is then stored; if that fails, it waits again."""
     return await desk.operations.plant_file.approve(who, order.number)
 
 
@@ -825,8 +825,8 @@ async def mark_corners(desk: Desk, who: Person, order: orders.Marks) -> MarksVie
     """Test the points that a user has clicked in a held picture.
 
     `number` is the number of the picture, and `points` contains the pixel coordinates of each
-    point by its name. Returns residuals, notes, and the target as seen from the front. With `save`, which needs the
-    command authority, the camera uses the points from now on.
+    point by its name. Returns residuals, notes, and the target as seen from the front. With `save`,
+    which needs the command authority, the camera uses the points from now on.
     """
     token = desk.token_of(who) if order.save else None
     points = {name: (x, y) for name, (x, y) in order.points.items()}
@@ -863,7 +863,7 @@ async def take_flight(desk: Desk, who: Person, blob: bytes) -> views.FlightView:
 
 @_call("GET learning", "calibration", fresh=FRESH)
 def learning(desk: Desk) -> tuple[views.LearningView, ...]:
-    """Return what was learnt about each heliostat group, when and from what, and which is in use."""
+    """Return what was learnt about each heliostat group, when, from what, and what is in use."""
     return desk.operations.automatic.learning.views()
 
 
