@@ -40,9 +40,10 @@ ELSEWHERE = 0.5
 DWELL_MS = 2000
 #: If the size of a full step is unknown, rough stepping moves by this many steps at a time.
 ROUGH_STEPS = 16
-#: Drivers that may be off are switched off after the motors have been at rest for this long, ms.
+#: Drivers that may be switched off at rest are switched off after the motors have been at rest for
+#: this long, ms.
 RELEASE_MS = 200
-#: Rest before a diagnosis reads the sensor, ms.
+#: Time that an axis is at rest before a diagnosis reads the sensor, ms.
 SETTLE_MS = 500
 
 
