@@ -347,6 +347,27 @@ def test_the_receiver_is_heated_in_steps_at_the_start_and_after_a_cloud() -> Non
     played(scene, sensors=(DNI_READING,), ramp=ramp / every)
 
 
+def test_after_an_emergency_the_field_returns_along_the_ramp() -> None:
+    ramp, every = 30e3, 15.0
+
+    async def scene(made: LivePlant) -> None:
+        sky, person = Sky(made), Person("Olga", Role.OPERATOR)
+        async with sky.shining():
+            await asyncio.sleep(130.0)
+            before = await greatest(made, every)
+            assert before > 1.5 * ramp
+            made.operations.emergency(person)
+            await asyncio.sleep(150.0)
+            made.operations.withdraw(person)
+            await asyncio.sleep(5.0)
+            made.operations.resume(person)
+            back = [0.95 * await greatest(made, every) for _ in range(16)]
+            assert np.diff([0.0, *back]).max() <= 1.3 * ramp, back
+            assert back[-1] > 0.9 * before
+
+    played(scene, sensors=(DNI_READING,), ramp=ramp / every)
+
+
 def test_beams_leave_the_receiver_where_new_motions_are_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -248,10 +248,7 @@ class Aiming:
             return
         while True:
             begun = self._plant.now()
-            if self._automatic.idle:
-                self._good_at = begun  # nothing moves, so no aims are late
-            else:
-                await self._step(begun)
+            await self._step(begun)
             await self._pause(begun)
 
     async def _pause(self, begun: float) -> None:
@@ -269,9 +266,12 @@ class Aiming:
 
     async def _step(self, now: float) -> None:
         """Compute and send aims; after a failure the last good aims stay in force."""
+        if self._automatic.idle:
+            self._stand_still(now)
+            return
         present = self._round(now)
         if not present.free.any():
-            self._good_at = now  # no heliostat may be moved, so no aims are late
+            self._stand_still(now)
             return
         try:
             # `asyncio.wait_for` of Python 3.11 may ignore that the program ends.
@@ -293,6 +293,20 @@ class Aiming:
                 await self._step(self._plant.now())
             elif not blind:
                 await self._go(answer.moves)
+
+    def _stand_still(self, now: float) -> None:
+        """Let a round pass in which nothing may be moved, so that no aims are late.
+
+        With a ramp, beams that have left lose their aims. The field would otherwise return to them
+        at once, for example after an emergency or a night.
+        """
+        self._good_at = now
+        if self._heating is None:
+            return
+        aims, on, visiting = self._automatic.aims, self._on(now), self._automatic.visiting
+        for row, name in enumerate(self._plant.field.names):
+            if not on[row] and name not in visiting:
+                aims.pop(name, None)
 
     def _measure(self, answer: Answer, present: Round) -> bool:
         """Record the flux on the receiver, and by how much the measured flux exceeds the limit.
