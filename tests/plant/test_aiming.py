@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from heliotrope.aims.heating import Heating
-from heliotrope.aims.rounds import forget
+from heliotrope.aims.rounds import Heat, forget
 from heliotrope.errors import InputError
 from heliotrope.field.aim_settings import AimSettings
 from heliotrope.field.flux_limit import FluxLimit
@@ -253,6 +253,62 @@ def test_heliostats_that_reach_no_cell_are_named_and_stay_at_standby() -> None:
         assert on.any()
 
     played(scene, sideways=True)
+
+
+def test_while_an_operator_commands_the_flux_is_watched_and_nothing_moves() -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        plant, operations = made.plant, made.operations
+        person = Person("Olga", Role.OPERATOR)
+        aims = tuple(sorted(operations.automatic.aims))
+        operations.automatic.give_way()
+        token = plant.take_authority(person).token
+        middle = plant.design.receivers[0].center
+        await operations.aim(person, token, dict.fromkeys(aims, middle)).end(30.0)
+        for _ in range(4):
+            await asyncio.sleep(5.0)
+            plant.authority.keep(person, token)
+        most, view = float(true_flux(made).max()), operations.aims()
+        assert most > LIMIT
+        assert view.idle == "Olga has the command authority"
+        assert view.at <= 16.0
+        assert view.peak == pytest.approx(most, rel=0.1)
+        assert view.reserve == pytest.approx(1.0 - view.peak / view.limit)
+        assert view.by_hand == aims
+        (text,) = texts(made, "flux_above_limit", active=True)
+        assert "the predicted flux is up to" in text
+        np.testing.assert_allclose(
+            plant.aims[[plant.field.place(name) for name in aims]], [middle] * len(aims)
+        )
+        operations.emergency(person)
+        await asyncio.sleep(30.0)
+        view = operations.aims()
+        assert (view.peak, view.power) == (0.0, 0.0)
+        assert view.idle == "an emergency is active"
+        assert not texts(made, "flux_above_limit", active=True)
+
+    played(scene)
+
+
+def test_beams_on_the_receiver_do_not_count_as_at_rest() -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        aims = made.operations.automatic.aims
+        on = len(aims)
+        assert on > 1
+        # As at the start of a program, which has not chosen the aims of the beams that it finds.
+        aims.clear()
+        view = made.operations.aims()
+        assert view.aimed == on
+        assert view.resting <= COUNT - on
+
+    played(scene)
+
+
+def test_with_a_map_limit_and_flux_are_those_of_one_cell() -> None:
+    heat = Heat(np.array([[50.0, 10.0]]), np.zeros((1, 2)), np.array([[100.0, 11.0]]), 1.0)
+    assert heat.fullest == (10.0, 11.0)
+    assert heat.excess == pytest.approx(10.0 / 11.0 - 1.0)
 
 
 def test_without_answers_the_last_good_aims_stay_and_then_the_safe_spread(
