@@ -11,7 +11,7 @@ import pytest
 
 from heliotrope.aims.heating import Heating
 from heliotrope.aims.rounds import Heat, forget
-from heliotrope.errors import InputError
+from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.aim_settings import AimSettings
 from heliotrope.field.flux_limit import FluxLimit
 from heliotrope.field.layouts import lay_out
@@ -23,6 +23,7 @@ from heliotrope.optics.surfaces import surface_of
 from heliotrope.plant.emergency import DNI_READING
 from heliotrope.plant.operations import aiming
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.views import Button
 from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.workers import at_once
@@ -275,6 +276,11 @@ def test_while_an_operator_commands_the_flux_is_watched_and_nothing_moves() -> N
         assert view.peak == pytest.approx(most, rel=0.1)
         assert view.reserve == pytest.approx(1.0 - view.peak / view.limit)
         assert view.by_hand == aims
+        why = operations.why(aims[0])
+        assert why.text == (
+            f"{aims[0]} is TRACKING on receiver: an operator has aimed it, so its beam stays there"
+        )
+        assert why.button is Button.AUTOMATIC
         (text,) = texts(made, "flux_above_limit", active=True)
         assert "the predicted flux is up to" in text
         np.testing.assert_allclose(
@@ -286,6 +292,21 @@ def test_while_an_operator_commands_the_flux_is_watched_and_nothing_moves() -> N
         assert (view.peak, view.power) == (0.0, 0.0)
         assert view.idle == "an emergency is active"
         assert not texts(made, "flux_above_limit", active=True)
+
+    played(scene)
+
+
+def test_an_aim_is_refused_in_one_line_that_says_what_to_do() -> None:
+    async def scene(made: LivePlant) -> None:
+        first, second = made.names[:2]
+        points = made.operations._aiming.points
+        made.operations.automatic.aims.clear()
+        with pytest.raises(UnknownNameError, match="there is no heliostat 'X1'"):
+            points(("X1",))
+        with pytest.raises(InputError, match=rf"^aim {first}: no aim under the flux limit; give "):
+            points((first,))
+        with pytest.raises(InputError, match=rf"^aim {first} \(and 1 more\): no aim .* state the"):
+            points((first, second))
 
     played(scene)
 

@@ -217,6 +217,11 @@ class Aiming:
             return
         self._by_person |= np.isin(self._plant.field.names, names)
 
+    def by_hand(self, heliostat: str) -> bool:
+        """Return whether a beam stays where an operator has aimed it, under a flux limit."""
+        row = self._plant.field.place(heliostat)
+        return self._settings.limit is not None and bool(self._by_person[row])
+
     def points(self, heliostats: Sequence[str]) -> Mapping[str, FloatArray]:
         """Return the aims on the first receiver, ENU, m, (3,), by name.
 
@@ -224,15 +229,18 @@ class Aiming:
         ------
         InputError
             If a heliostat has no aim under the flux limit.
+        UnknownNameError
+            If there is no such heliostat.
         """
         if self._settings.limit is None:
             return self._plant.default_aims(heliostats)
-        aims = self._automatic.aims
-        without = [name for name in heliostats if name not in aims]
+        aims, place = self._automatic.aims, self._plant.field.place
+        without = [name for name in heliostats if place(name) >= 0 and name not in aims]
         if without:
+            more = f" (and {len(without) - 1:,} more)" if len(without) > 1 else ""
             raise InputError(
-                f"aim: {len(without)} heliostats, {without[0]} first, have no aim under the flux "
-                "limit; give them to automatic control, or leave them at standby"
+                f"aim {without[0]}{more}: no aim under the flux limit; give it to automatic "
+                "control, leave it at standby, or state the point on the receiver"
             )
         return {name: aims[name] for name in heliostats}
 
