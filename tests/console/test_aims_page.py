@@ -58,7 +58,8 @@ def test_the_page_says_that_the_flux_is_above_the_limit(
     monkeypatch: pytest.MonkeyPatch, enter: Callable[..., Any]
 ) -> None:
     nan = float("nan")
-    over = replace(VIEW, reserve=-0.12, problem="", planned=nan, by_hand=(), at=float("inf"))
+    over = replace(VIEW, reserve=-0.12, problem="", planned=nan, by_hand=(), limit=47.5)
+    over = replace(over, at=float("inf"))
     monkeypatch.setattr(Aiming, "view", lambda _: over)
     page = enter("viewer", viewport={"width": 400, "height": 900})
     page.click(".hx-tabs >> text=Plant")
@@ -68,6 +69,7 @@ def test_the_page_says_that_the_flux_is_above_the_limit(
     assert "Left of the limit" not in shown
     assert "161, – kW" in shown
     assert "Computed –" in shown
+    assert "0.05, 551 kW/m²" in shown
     assert page.evaluate("document.documentElement.scrollWidth") <= 400
 
 

@@ -465,6 +465,12 @@ def test_the_head_fits_into_every_width(enter: Callable[[str], Any]) -> None:
             assert beside or box["y"] >= stop["y"] + stop["height"], (width, part)
         for part in (".hx-head", ".hx-name", ".hx-tabs"):
             assert page.locator(part).evaluate("e => e.scrollWidth <= e.clientWidth"), (width, part)
+        # Of all parts, the speed of a simulation gives way first.
+        assert page.evaluate("""() => {
+            const name = document.querySelector(".hx-name");
+            document.querySelector(".hx-head .hx-hint").textContent = "simulated at 2.0 × real time";
+            return name.scrollWidth <= name.clientWidth;
+        }"""), width
         assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 

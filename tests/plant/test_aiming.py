@@ -242,6 +242,27 @@ def test_a_limit_that_no_aims_hold_later_leaves_the_last_good_aims(
     played(scene)
 
 
+def test_beams_that_a_program_finds_leave_where_no_aims_ever_hold_the_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As after a restart with a wrong limit in the plant file."""
+
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        part = made.operations._aiming
+        monkeypatch.setattr(aiming.Aiming, "_allowed", lambda self, limit, scene: FluxLimit(100.0))
+        part._answer, part._source = None, ""
+        await asyncio.sleep(60.0)
+        assert made.operations.aims().source == ""
+        assert texts(made, "flux_above_limit", active=True)
+        assert true_flux(made).max() > 0.0
+        await asyncio.sleep(150.0)
+        assert made.operations.aims().source == "safe spread"
+        assert true_flux(made).max() == 0.0
+
+    played(scene, deadline=30.0)
+
+
 def test_heliostats_that_reach_no_cell_are_named_and_stay_at_standby() -> None:
     async def scene(made: LivePlant) -> None:
         await asyncio.sleep(90.0)

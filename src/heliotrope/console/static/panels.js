@@ -96,7 +96,7 @@ export function plant(box) {
 // The flux limit, and how aims hold it; nothing where aims are spread.
 function aimsView(aims) {
   if (aims.strategy !== "limit") return [];
-  const share = (value) => value === null ? "–" : `${number(100 * value, 1)} %`, kilowatts = (value) => value === null ? "–" : number(value / 1e3, 0);
+  const share = (value) => value === null ? "–" : `${number(100 * value, 1)} %`, kilowatts = (value) => value === null ? "–" : number(value / 1e3, value > 0 && value < 1e4 ? 2 : 0);
   const named = (names) => `${count(names.length)}: ${names.slice(0, 5).join(", ")}${names.length > 5 ? ", …" : ""}`;
   const sources = { optimiser: t("optimiser"), "last good aims": t("last good aims"), "safe spread": t("safe spread") };
   const above = aims.reserve !== null && aims.reserve < 0;

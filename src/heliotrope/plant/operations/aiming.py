@@ -452,16 +452,18 @@ class Aiming:
             self._log.take_alarm(alarms.AIMS.raised(problem=problem))
         self._problem = problem
         late = self._plant.now() - self._good_at
-        if self._answer is None:
-            return
         if late < SAFE * self._settings.deadline:
-            self._source = "last good aims"
+            self._source = "" if self._answer is None else "last good aims"
         elif self._source != "safe spread":
             self._source = "safe spread"
-            await self._to_safe(self._answer.safe)
+            nowhere = np.full((len(self._plant.field), 3), np.nan)
+            await self._to_safe(nowhere if self._answer is None else self._answer.safe)
 
     async def _to_safe(self, safe: FloatArray) -> None:
-        """Go to the safe spread; beams at other aims leave first, so that beams never overlap."""
+        """Go to the safe spread; beams at other aims leave first, so that beams never overlap.
+
+        Beams without an aim there (NaN) stay at standby.
+        """
         on = self._on(self._plant.now()) & self._movers(self._plant.now())
         apart = ~(np.linalg.norm(self._plant.aims - safe, axis=1) < 0.05)
         rows = np.flatnonzero(on & apart)
