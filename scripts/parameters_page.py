@@ -31,19 +31,20 @@ KINDS = {
 }
 
 #: Said below the table of models.
-ROLES = """`malan8`, `guo6` and `khalsa8` are listed here for azimuth-elevation mechanisms. For
-another kind of mechanism, the model consists of that kind's own parameters with the same roles.
-Roles are `position`, `tilts`, `biases`, `scales`, `non_orthogonality` and `canting`. Models, roles
-and parameters can be combined: `malan8+canting`, `tilts+biases+sag`."""
+ROLES = """The table lists `malan8`, `guo6` and `khalsa8` for azimuth-elevation mechanisms. For
+another kind of mechanism, these models consist of the parameters of that kind with the same roles.
+The roles are `position`, `tilts`, `biases`, `scales`, `non_orthogonality` and `canting`. To define
+a model of your own, join models, roles and parameters by `+`: `malan8+canting`,
+`tilts+biases+sag`."""
 
 
 def pages() -> dict[str, str]:
     """Return the page's text, by path."""
     said = (
         "Each parameter is a deviation from the nominal mechanism. This page is generated from the "
-        "table in the program (`python -m scripts.pages`). The names of drive parameters begin "
-        "with the name of the drive's joint. Other kinds of mechanism have the same rows, with the "
-        "names of their own joints."
+        "table in the program (`python -m scripts.pages`). The two tables are for the two kinds "
+        "named in their headings. Other kinds of mechanism have the same parameters, but the names "
+        "of drive parameters begin with the names of their own joints."
     )
     lines = ["# Parameters of a mechanism", "", said]
     for kind, (joints, linear) in KINDS.items():

@@ -10,42 +10,47 @@ PAGE = "docs/explanation/safety.md"
 _INTRO = """\
 # Safety
 
-One table (`heliotrope.safety`) contains one row for each safety condition. The row says when the
+The safety table (`heliotrope.safety`) has one row for each safety condition. The row says when the
 condition trips, what is then done, and when it is released. The plant, the clusters and the local
 controllers each evaluate the rows assigned to them. The evaluation is a pure function of readings,
-state and monotonic time. `python -m scripts.pages` writes this page from the table. The handbook
-says what each alarm means and what the operator should do.
+state and monotonic time. `python -m scripts.pages` writes this page from the table. [The
+handbook](../how-to/handbook.md) says what each alarm means and what the operator should do.
 
-The numbers are defaults. Before a plant runs with them, replace the wind limits by those of the
-heliostat's maker and the receiver limits by those of the receiver's maker, in the tables
-[`[safety.CONDITION]` of the plant file](../reference/plant-format.md#limits-of-the-site).
-`heliotrope field safety PLANT` shows what is in force.
+The numbers below are defaults. Before you run a real plant, replace the wind limits by those of
+the heliostat's manufacturer, and the receiver limits by those of the receiver's manufacturer. Do
+this in the tables [`[safety.CONDITION]` of the plant
+file](../reference/plant-format.md#limits-of-the-site). `heliotrope field safety PLANT` shows the
+values that are in force.
 
 ## Rules for every row
 
 - A reading that is missing, not a number, or from the future is ignored. The last good reading is
-  used until it is older than *stale after*; from then on the worst case is assumed. In rows about
-  an age or a silence (*grows*), the time continues to increase without new readings.
+  used until it is older than *stale after*; from then on the worst case is assumed. Some rows
+  measure the time since something was last received. While nothing arrives, their value continues
+  to grow; in the column *stale after* these rows are marked *grows*.
 - A row trips when its value has been at the limit or beyond it for the *delay*. It is released when
-  fresh readings have been on the safe side of the release limit for the time given. Between the two
-  limits it does not change. If readings stop arriving, nothing is released.
+  fresh readings have been on the safe side of the release limit for the time given in *releases
+  when*. Between the two limits the row stays as it is. If readings stop arriving, nothing is
+  released.
 - A row that *latches* remains tripped until its cause has gone and a person with the given role, or
   a higher one, acknowledges it. An acknowledgement before the cause has gone is refused.
-- If several rows have tripped, the strongest action applies; the list below goes from the weakest
-  to the strongest. DEFOCUS and STOW pre-empt every motion. The release of a row does not move any
-  heliostat: returning to the receiver needs a fresh command under the command authority.
-- The *budget* is the time from the fault to the finished action, including the detection.
+- If several rows have tripped, the strongest of their actions applies; the list below goes from
+  the weakest to the strongest. DEFOCUS and STOW interrupt every motion. The release of a row does
+  not move any heliostat: to return to the receiver, heliostats need a new command from the holder
+  of the command authority.
+- The *budget* is the time allowed from the fault to the finished action, including the time to
+  detect the fault.
 """
 
 _AFTER = f"""
 ## The proof of an emergency
 
-An order to DEFOCUS or STOW the field starts a list of all heliostats (`Proof`). Each heliostat must
-acknowledge the order within {safety.ORDER_BUDGET:g} s and have carried it out within
-{safety.DEFOCUS_BUDGET:g} s (DEFOCUS) or {safety.STOW_BUDGET:g} s (STOW); a heliostat that fails to
-do so is named. Reports from other heliostats, or from before the order, prove nothing. A fresh
-reading must show that the flux on the receiver is below 10 % of nominal; otherwise
-`flux_after_emergency` trips.
+When the whole field is ordered to DEFOCUS or STOW, the plant keeps a list of all heliostats
+(`Proof`). Each heliostat must acknowledge the order within {safety.ORDER_BUDGET:g} s and have
+carried it out within {safety.DEFOCUS_BUDGET:g} s (DEFOCUS) or {safety.STOW_BUDGET:g} s (STOW); a
+heliostat that fails to do so is named. Reports from other heliostats, or from before the order,
+prove nothing. A fresh reading must show that the flux on the receiver is below 10 % of nominal;
+otherwise `flux_after_emergency` trips.
 
 ## Joining the receiver
 
@@ -54,8 +59,8 @@ burst + rate · T in any span of T seconds.
 
 ## What the table does not do
 
-The table is evaluated by software on ordinary computers, which has no safety integrity level. The
-receiver's own protection and the emergency line must not depend on it. The limits have not been
+The table is evaluated by software that has no safety integrity level (SIL), on ordinary computers.
+The receiver's own protection and the emergency line must not depend on it. The limits have not been
 tried on a real plant.
 """
 

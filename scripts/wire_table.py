@@ -37,19 +37,19 @@ Numbers are little-endian. COBS encoding removes every zero byte from the frame,
 | {wire.MAC_SIZE} | in messages that store settings: MAC, a truncated HMAC-SHA256 over all preceding bytes; in signed frames: the tag; absent in all other frames |
 | 4 | CRC-32 over all preceding bytes (the same CRC as in zlib) |
 
-A frame with invalid byte stuffing, checksum, version or length has no effect except that it increments a counter. A frame of a type that is not in the table is decoded, and its payload is passed on as bytes. A frame whose payload contains a non-finite number has no effect.
+A receiver ignores a frame with invalid byte stuffing, checksum, version or length, and only counts it. It also ignores a frame whose payload contains a number that is not finite. If the type of a frame is not in the table of messages, the receiver passes the payload on as bytes.
 
 ## What acts
 
 A local controller acts on a frame under these conditions:
 
-- DEFOCUS and STOW always act, whoever sends them.
-- Questions are always answered, because they change nothing.
-- Any other frame must be new. The sender numbers its frames with a 32-bit counter. Each frame carries the lower 16 bits as its sequence number. Once a second, the sender broadcasts SESSION with the upper 16 bits, its epoch and the token of the command authority. A SESSION is accepted if its pair (epoch, count) is greater than that of the last accepted SESSION. Any other frame is accepted if its sequence number is 1 to 32767 after the last accepted one. After a restart of the receiver or {wire.SILENCE_MS // 1000} s of silence, no other frame is accepted before a SESSION. The epoch must increase with every start of the sender; for example, it can be the GPS second of the start.
-- A command that needs the command authority must carry the token of the last SESSION (0 means that nobody has the authority) and must not have expired: by the receiver's clock, the second in which it expires must not have passed, and must be at most {wire.HORIZON_S} s ahead. A receiver without a valid clock refuses every such command.
+- It always obeys DEFOCUS and STOW, whoever sends them.
+- It always answers questions, because they change nothing.
+- Any other frame must be new. To make this recognisable, the sender numbers its frames with a 32-bit counter. Each frame carries the lower 16 bits as its sequence number. Once a second, the sender broadcasts SESSION with the upper 16 bits, its epoch and the token of the command authority. A SESSION is accepted if its pair (epoch, count) is greater than that of the last accepted SESSION. Any other frame is accepted if its sequence number is 1 to 32767 after the last accepted one. After a restart of the receiver or {wire.SILENCE_MS // 1000} s of silence, no other frame is accepted before a SESSION. The epoch must increase with every start of the sender; for example, it can be the GPS second of the start.
+- A command that needs the command authority must carry the token of the last SESSION (0 means that nobody has the authority) and must not have expired. The command states the second in which it expires; by the receiver's clock, this second must not have passed, and must be at most {wire.HORIZON_S} s ahead. A receiver without a valid clock refuses every such command.
 - A message that stores a setting must also carry a MAC made with the receiver's key, and an edition number greater than the last one stored. The edition is stored in the journal together with the setting, so a recorded message can never be replayed.
 
-Except for the MAC, these rules prevent accidents only; they do not stop a person with access to the bus. Signed frames do.
+Except for the MAC, these rules only prevent accidents. They do not stop an attacker who has access to the bus; signed frames do.
 
 ## Signed frames
 
@@ -61,7 +61,7 @@ A bus may have a key of {signing.KEY_SIZE} bytes, which the cluster and its loca
 | SESSION to all | the epoch and the 32-bit count, from the payload and the header of the frame |
 | any other | the epoch of the last SESSION and the 32-bit count, which the receiver reconstructs from the sequence number |
 
-- A local controller with a bus key refuses unsigned frames of these two kinds ("wrong key"). Messages that store settings still carry the MAC made with the controller's own key, and are not signed. DEFOCUS, STOW and questions are accepted from anyone; a question is then no longer regarded as a sign of life of the cluster.
+- A local controller with a bus key refuses unsigned frames from the cluster or the authority (with the result "wrong key"). Messages that store settings still carry the MAC made with the controller's own key, and are not signed. DEFOCUS, STOW and questions are accepted from anyone. Because anyone can send a question, a question no longer counts as a sign that the cluster is alive.
 - After a start, or after {wire.SILENCE_MS // 1000} s without a valid frame, the local controller sets the flag SESSION_WANTED in its STATUS. The cluster then sends QUERY_BUS, and a SESSION to the controller's address that is signed over the number from the reply. After a start, the controller accepts no other SESSION.
 - SET_BUS_KEY carries the bus key, encrypted by XOR with the HMAC-SHA256 of the edition under the key of the local controller. It needs no session, and is accepted while the mirror is at rest (stowed, locked, idle, defocused, in FAULT, or unconfigured).
 - A local controller without a bus key accepts signed frames and ignores their tags. Firmware that does not support signed frames counts them as frames of another version and does not act on them.
@@ -109,7 +109,7 @@ def pages() -> dict[str, str]:
 
 
 #: Measured by ``python -m benchmarks frames``.
-DAMAGE = """Ten million frames of all types were damaged at random in five ways and then decoded (`python -m benchmarks frames`). For comparison, the same was done with ten million packets in the format of Malan's thesis, which has a length and a one-byte sum; the packets were separated by silence, which is the best case for that format. A false accept is a decoded frame or packet that was never sent.
+DAMAGE = """Ten million frames of all types were damaged at random in five ways and then decoded (`python -m benchmarks frames`). For comparison, ten million packets in the format of Malan's thesis were damaged in the same ways; these packets have a length and a one-byte checksum. They were separated by silence on the bus, which is the best case for that format. A false accept is a frame or packet that the receiver decodes although it was never sent.
 
 | damage | frames | false accepts | packets | false accepts |
 |---|---|---|---|---|
@@ -119,4 +119,4 @@ DAMAGE = """Ten million frames of all types were damaged at random in five ways 
 | 1 to 12 bytes added | 2,000,954 | 0 | 2,000,746 | 0 |
 | the head of one and the tail of another | 2,000,478 | 0 | 1,998,360 | 479 (1 in 4,171) |
 
-A receiver that looks for packets at every byte, without separation by silence, finds 38,897 packets in ten million bytes of noise. In version 2, a fraction of 2^-32 of heavily damaged frames is accepted by chance, that is, one in four thousand million. Stored settings are additionally protected by a MAC."""  # noqa: E501
+If packets are not separated by silence, a receiver has to look for a packet at every byte; it then finds 38,897 packets in ten million bytes of noise. In version 2 of the wire, one in four thousand million heavily damaged frames (2^-32) is accepted by chance. Stored settings are additionally protected by a MAC."""  # noqa: E501

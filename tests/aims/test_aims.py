@@ -118,6 +118,22 @@ def test_prices_far_from_the_best_bound_it_too(scene: Scene, peak: float) -> Non
         assert bound(found, cap, scale * got.prices)[0] >= got.power
 
 
+@pytest.mark.parametrize(("share", "swept"), [(0.998, False), (0.9, True), (1.1, True)])
+def test_a_start_is_swept_again_only_if_the_cap_has_changed(
+    scene: Scene, peak: float, share: float, swept: bool
+) -> None:
+    found = candidates(FieldFlux(scene))
+    cap = np.full((28, 18), 0.6 * peak)
+    first, sweeps = optimise(found, cap), []
+    got = optimise(
+        found, share * cap, first, gap=3e-3, progress=lambda k, count: sweeps.append((k, count))
+    )
+    assert bool(sweeps) == swept
+    assert (got.flux <= share * cap * (1.0 + 1e-9)).all()
+    assert got.gap < 0.01
+    assert got.bound >= optimise(found, share * cap).power
+
+
 @pytest.mark.parametrize("surface", [CYLINDER, PLATE])
 def test_the_gradient_is_that_of_moved_aims(surface: Surface) -> None:
     given, rng = field(40, surface), np.random.default_rng(3)

@@ -982,7 +982,7 @@ def test_the_work_survives_a_camera_that_fails() -> None:
 
 
 def test_work_settings_that_are_none() -> None:
-    with pytest.raises(InputError, match=r"a cycle of 0\.0 s"):
+    with pytest.raises(InputError, match="a cycle of 0 s"):
         AutomaticSettings(beat=0.0)
     with pytest.raises(InputError, match="losses must be 0 or more, not -1"):
         AutomaticSettings(losses=-1)

@@ -222,19 +222,13 @@ def settle(order, images, shifts, power, idle, choice, over, fine, fill):
             if value > gain:
                 best, gain = before, value
             net[before] = -1e300
-        while True:
-            a = 0
-            for b in range(1, len(net)):
-                if net[b] > net[a]:
-                    a = b
-            # The remaining candidates have less power, so none of them is better.
+        for a in range(len(net)):
             if net[a] <= gain:
-                break
+                continue
             most = (net[a] - max(gain, -1e15)) / fine
             value = net[a] - fine * _excess(i, a, images, shifts, over, most)
             if value > gain:
                 best, gain = a, value
-            net[a] = -1e300
         choice[i] = best
         if best >= 0:
             _add(i, best, 1.0, images, shifts, over)

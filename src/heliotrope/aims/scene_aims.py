@@ -16,7 +16,7 @@ import numpy.typing as npt
 from heliotrope.aims.candidates import Candidates, candidates, middles, surface_in
 from heliotrope.aims.errors import Risk, SharedErrors, assess, gains
 from heliotrope.aims.gradient import ascend
-from heliotrope.aims.optimiser import Choice, Step, optimise
+from heliotrope.aims.optimiser import GAP, Choice, Step, optimise
 from heliotrope.aims.strategies import Strategy, choose
 from heliotrope.errors import InputError
 from heliotrope.field.flux_limit import FluxLimit
@@ -33,8 +33,8 @@ FREE = 3
 BEYOND = 1.5
 #: Minimum share of the limit left to the next choice after errors; excess that counts as zero.
 LEAST, HOLDS = 0.02, 1e-3
-#: Sweeps of every choice after the first.
-AGAIN = 2
+#: Sweeps of every choice after the first, and the gap with which a choice from a start ends.
+AGAIN, LATER_GAP = 2, 2e-3
 #: A cell binds if its quantile is within this share of the limit.
 BINDS = 0.01
 #: Ratio of two levels of a wanted map between which no further one is tried.
@@ -241,6 +241,7 @@ def _held(
     aimed_at = (1.0 - BELOW) * limit
     # Difference between the engine's flux quantile and the sum of the images.
     more = np.zeros_like(limit)
+    gap = GAP if start is None else LATER_GAP
     choice = None if start is None else start.choice
     if start is not None:
         # Relative to the light, which may have changed.
@@ -252,6 +253,7 @@ def _held(
         first = choice is None
         choice = optimise(
             field, np.ascontiguousarray(cap.T), choice, keep=demand.keep,
+            gap=gap,
             progress=_part(progress, k), **({} if first else {"sweeps": AGAIN if k < FREE else 0}),
         )  # fmt: skip
         trial = _evaluated(scene, field, choice, demand, limit, light)

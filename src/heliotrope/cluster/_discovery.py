@@ -18,7 +18,8 @@ SPAN = 1e-3 * HERE_SLOTS * HERE_SLOT_MS + 0.06
 _LARGEST = 0xFFFFFFFF
 _HERE = messages.NUMBER_OF["HERE"]
 _CLEAN = 2
-#: A single serial number that is still garbled after this many queries is noise.
+#: If replies for a single serial number are still garbled after this many queries, they are taken
+#: for noise.
 _GARBLED = 4
 
 

@@ -29,9 +29,11 @@ from heliotrope.safety import (
 )
 
 _LINE = "emergency_line"
-#: The row for the plant's silence trips after this time plus autonomy, s; no lease may be longer.
+#: The condition for the plant's silence trips after this time plus the autonomy, s; no lease may be
+#: longer.
 _PLANT_LEASE = 3.0
-#: A row that has tripped resets below 2 s of silence; a shorter lease would never reset it.
+#: Once that condition has tripped, it releases only below 2 s of silence; with a shorter lease it
+#: would never release.
 _SHORTEST_LEASE = 1.0
 #: Represents an unknown time error, s.
 _UNBOUNDED = 1e9  # beyond safety.condition.UNKNOWN_TIME

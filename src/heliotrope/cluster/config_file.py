@@ -55,7 +55,7 @@ class BusTable(Table):
 
     url: str = Field(min_length=1, description="`/dev/ttyUSB0` or `socket://host:port`.")
     baud_rate: int = Field(115200, ge=1200, le=4_000_000, description="Bits per second.")
-    echo: bool = Field(False, description="The adapter receives its own frames.")
+    echo: bool = Field(False, description="Whether the adapter also receives what it sends.")
     answer_s: float = Field(
         0.05,
         ge=0.001,

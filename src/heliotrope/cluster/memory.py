@@ -18,7 +18,7 @@ from heliotrope.errors import FormatError
 from heliotrope.files.disk import AtOnce, Disk
 
 _BLOCK = 64
-#: The next block is reserved when fewer editions than this are left.
+#: A new block of edition numbers is reserved when fewer than this many are left.
 _AHEAD = 16
 _LARGEST = 0xFFFFFFFF
 

@@ -38,11 +38,12 @@ FAR = 1.6
 ELSEWHERE = 0.5
 #: Time for which the spiral stays at a point, ms.
 DWELL_MS = 2000
-#: Rough stepping accumulates this many steps if the full step is unknown.
+#: If the size of a full step is unknown, rough stepping moves by this many steps at a time.
 ROUGH_STEPS = 16
-#: Drivers that may be off are switched off after the motors have been at rest for this long, ms.
+#: Drivers that may be switched off at rest are switched off after the motors have been at rest for
+#: this long, ms.
 RELEASE_MS = 200
-#: Rest before a diagnosis reads the sensor, ms.
+#: Time that an axis is at rest before a diagnosis reads the sensor, ms.
 SETTLE_MS = 500
 
 

@@ -2,8 +2,8 @@
 
 from . import states
 
-#: Source of an event: anyone at any time; the command authority, with a fresh frame; the controller
-#: itself.
+#: Who can cause an event: anyone at any time; the command authority, with a fresh frame; the
+#: controller itself.
 SAFE, COMMAND, INTERNAL = range(3)
 
 #: Event: kind, meaning.

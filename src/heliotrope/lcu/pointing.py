@@ -28,7 +28,7 @@ STEPS, NEWTON_STEPS, TRIALS = 20, 60, 20
 DEGENERATE_LIMIT = 1e-6
 #: A pose on the branch of the last pose that moves less than this (rad) is accepted at once.
 CLOSE = 0.05
-#: A pose on the last branch that moves less than this (rad) is accepted at once.
+#: An angle that is beyond a stop by less than this (rad) counts as within the stops.
 STOP_SLACK = 1e-6
 
 

@@ -19,7 +19,8 @@ from heliotrope.safety import Alarm, alarms
 
 #: Interval between two checks of the files, s.
 LOOKED = 2.0
-#: An alarm is active during the last days of a certificate, and is raised again each day.
+#: Number of days before the expiry of a certificate from which an alarm is active; it is raised
+#: again each day.
 DAYS = 30
 _DAY = 86_400.0
 #: Values that change when a file does: time, inode, size and mode; None if the file is missing.

@@ -12,8 +12,8 @@
 - `mirror_image`: the flux of one heliostat on a target, for photographs and their simulation, and
   the shift of its centroid by neighbours that shade and block it.
 - `learnt_surface`: the slopes of a mirror, learnt from photographs of its beam.
-- `coverage`: the fraction of a grid's cells that polygons cover (a function of the same name, so it
-  stays there).
+- `coverage`: the fraction of a grid's cells that polygons cover (import it from this
+  module, because the function has the same name).
 - `keep_out`: beams that enter keep-out volumes; `glare`: the eye hazard, for information only.
 
 Begin with `image_offsets` for a tracking error, `field_flux` for a plant.

@@ -59,10 +59,10 @@ from heliotrope.store.records import PlannedVisit, StoreError
 
 #: A calibration that removes the errors of quick installation.
 CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model="auto")
-#: Age above which a silent heliostat is not waited for at the end, s.
+#: At its end the plant does not wait for a heliostat that has been silent for longer than this, s.
 SILENT = 10.0
-#: Time after which a held heliostat that has not moved is no longer waited for, s. Large plants
-#: poll step counts every five seconds.
+#: At its end the plant no longer waits for a locked or faulty heliostat that has not moved for this
+#: time, s. In large plants step counts are polled every five seconds.
 _STANDS = 15.0
 #: Interval at which the sensors are read, s.
 _SENSED = 0.5

@@ -91,7 +91,8 @@ from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.safety import Act, Alarm, Condition, alarms, conditions, limited
 from heliotrope.sun import fast_vector
 
-#: A repeated safe order of the same person within this time joins the earlier one, s.
+#: If the same person repeats a DEFOCUS or STOW within this time, s, while the earlier one is still
+#: in progress, both count as one order.
 _SAME = 0.25
 #: Pause between two passes over the parameters and the owed records, s.
 _SLOW_BEAT = 1.0

@@ -21,8 +21,9 @@ _OPERATOR, _SUPERVISOR = AcknowledgeRole
 PLANT_LEASE, SUN_LEASE = 3.0, 6.0
 #: Time from a DEFOCUS to STOW, unless the DEFOCUS is lifted, s.
 _PATIENCE = 30.0
-#: The same time if only a cluster is left. A cluster does not know the keep-out volumes, and its
-#: DEFOCUS may have turned a beam into such a volume, where the beam must not stay for 30 s.
+#: The same time if a cluster acts without the plant, s. A cluster does not know the keep-out
+#: volumes; its DEFOCUS may have turned a beam into such a volume, where the beam must not stay for
+#: 30 s.
 _ALONE = 20.0
 
 

@@ -31,7 +31,7 @@ _UNITS: dict[str, dict[str, float]] = {
 }
 #: Safest value of a reading whose low values are unsafe.
 _SAFEST = {"share": 1.0, "rad": math.pi / 4.0, "°C": 40.0}
-#: Angles below this are shown in mrad, rad.
+#: Angles below this value, in rad, are shown in mrad.
 _SMALL = 0.05
 #: Smallest and largest value of a time key, s. A ``then_stow`` longer than that of the row is also
 #: rejected.

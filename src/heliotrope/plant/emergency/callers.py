@@ -21,7 +21,8 @@ from heliotrope.safety import Act
 REPEATED, REPEATED_SPAN = 10, 10.0
 #: The first pause, s; each later pause is twice as long, up to the longest.
 PAUSE, LONGEST_PAUSE = 30.0, 480.0
-#: Withdrawals by others after which a person must pause; after fewer, the person may have a reason.
+#: Number of withdrawals by others after which a person must pause. With fewer, the person may have
+#: a good reason to repeat the order.
 MOST_WITHDRAWN = 5
 #: Withdrawals count for this long after the last one, s.
 REMEMBERED = 600.0

@@ -33,13 +33,15 @@ from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.safety import FLUX_READING, AcknowledgeRole, Act, Alarm
 from heliotrope.store.records import StoreError
 
-#: A heliostat that was ordered off the receiver reports it within this time, s.
+#: Time within which the reports of a heliostat that was ordered off the receiver must show that it
+#: has left, s.
 OFF_SHOWS = 10.0
 #: Longest pause between two orders to one heliostat whose reports do not show them, s.
 LONGEST_PAUSE = 60.0
 #: Row for heliostats that were not confirmed to have carried out an emergency order.
 UNPROVEN = "unproven_after_emergency"
-#: A heliostat that was confirmed after its emergency is reported to the table for this long, s.
+#: Time for which the safety table is told that a heliostat has been confirmed after its emergency,
+#: s.
 _PROVEN_SHOWS = 5.0
 #: Interval between two records of a proof in progress, s.
 _KEEP_PERIOD = 1.0

@@ -41,7 +41,8 @@ CHECK_PERIOD = 2.0
 NOTED = 1e-3
 #: Maximum number of heliostats named; with more, the alarm concerns the whole field.
 MOST_NAMED = 150
-#: Time from when a beam is first seen to be sent to its point until its step counts are used, s.
+#: The step counts of a heliostat are used only when they are this much newer than the moment at
+#: which its beam was first seen to be sent to its point, s.
 _SETTLE = 1.0
 #: An axis that approaches its goal by this much between two checks is still moving, rad.
 _CLOSING = 1e-4

@@ -34,7 +34,7 @@ from heliotrope.lcu.config import FAR
 #: Points of one kind (AIM, STANDBY) by name of the heliostat, ENU, m.
 Places = dict[str, tuple[float, ...]]
 KINDS = tuple(sorted(messages.POINTS))
-#: Points before the assigned one that a local controller may still have.
+#: Number of points before the assigned one that a local controller may still be using.
 BEFORE = 4
 #: Kinds under which these earlier points are stored, latest first.
 EARLIER = {kind: tuple(f"{kind}-{i}" for i in range(1, BEFORE + 1)) for kind in KINDS}

@@ -7,8 +7,8 @@ from heliotrope.links.messages import ClusterStatus
 from heliotrope.plant.field.part import Part
 from heliotrope.safety import Alarm, alarms
 
-#: An alarm waits this long, s, because after a start the first clusters to report may be the
-#: minority.
+#: The alarm is raised only after this time, s, because right after a start the first clusters to
+#: report may be the minority.
 PATIENCE = 5.0
 #: Name of the reference if the plant knows what every cluster should have.
 EXPECTED = "this plant"

@@ -18,8 +18,8 @@ from heliotrope.calibration.record import Identities
 from heliotrope.calibration.sightings import Sightings, join
 from heliotrope.geometry import FloatArray
 
-#: Maximum number of flights in the fits, the latest ones, because each flight adds its shared
-#: errors to the part of every heliostat.
+#: Maximum number of flights that fits use, the latest ones. Each further flight adds its shared
+#: errors to the fit of every heliostat.
 MOST = 8
 
 

@@ -10,7 +10,8 @@ from heliotrope.calibration.learn import worker
 from heliotrope.calibration.learn.group import GroupHistory, LearntGroup, gathered
 from heliotrope.errors import InputError
 
-#: Longest time for one group, s; 60 heliostats with 120 sightings each take some minutes.
+#: Longest time that learning about one group may take, s; 60 heliostats with 120 sightings each
+#: take some minutes.
 LONGEST = 4 * 3600.0
 _MODULE = "heliotrope.calibration.learn.worker"
 

@@ -7,7 +7,7 @@ from heliotrope.plant.field.clusters import Clusters
 from heliotrope.plant.field.part import Part
 from heliotrope.plant.field.state import FieldState
 
-#: A cluster is queried again for the names of its rows after this time, s.
+#: Time after which a cluster is asked again for the names of its rows, s.
 _AGAIN = 5.0
 
 

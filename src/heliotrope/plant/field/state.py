@@ -27,7 +27,7 @@ STALE = 3.0
 OUT_OF_ORDER = (states.FAULT, states.UNCONFIGURED)
 #: States in which a heliostat moves only to turn away and to go to stow.
 _HELD = (states.LOCKED, states.FAULT)
-#: Goals that differ by more steps than this belong to another motion.
+#: If the goals in two reports differ by more steps than this, they belong to different motions.
 _TURN = 200
 
 Mask = npt.NDArray[np.bool_]

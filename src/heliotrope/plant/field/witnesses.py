@@ -28,8 +28,8 @@ from heliotrope.plant.field.part import Part
 from heliotrope.safety import Alarm, alarms
 from heliotrope.sun import Site, fast_vector
 
-#: A witnessed sun vector that differs from the plant's own by more than this, plus the error of the
-#: witness, contradicts it, rad: 14 s of time, or the limit at which a cluster's site differs.
+#: A witness contradicts the plant if its sun vector differs from the plant's by more than this,
+#: rad, plus the error of the witness: 14 s of time, or the limit at which a cluster's site differs.
 AGREES = 1e-3
 #: Errors of the witnesses, rad: of a sun sensor, and of a beam whose heliostat was calibrated (the
 #: limit of `pointing_disagrees`).

@@ -12,7 +12,7 @@ from heliotrope.errors import HeliotropeError
 from heliotrope.local import Buckets
 from heliotrope.plant.orders.authority import Person
 
-#: Orders of one person, and of all persons: rate, 1/s, and burst.
+#: Rate (1/s) and burst of the orders of one person, and of all persons together.
 OWN, ALL = (10.0, 100.0), (30.0, 200.0)
 
 

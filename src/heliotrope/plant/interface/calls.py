@@ -737,9 +737,9 @@ async def check_plant_file(desk: Desk, who: Person, order: orders.PlantFileText)
 async def put_plant_file(desk: Desk, who: Person, order: orders.PlantFileOrder) -> PlantFileStored:
     """Replace the plant file by a text without errors, and keep the old one; nothing moves.
 
-    `version` is the version of the text that you changed, as returned with it; if the file has
-    changed since, nothing is stored. The `reason` is recorded. A text that is used at once needs
-    the command authority. If the plant file requires a
+    `version` is the version of the text that you changed, as returned by `GET plant-file`; if the
+    file has changed since, nothing is stored. The `reason` is recorded. If the plant uses the new
+    text at once, the request needs the command authority. If the plant file requires a
     [second approval](plant-format.md#second-approval), nothing is written until then.
     """
     return await desk.operations.plant_file.store(who, order.text, order.version, order.reason)
@@ -747,7 +747,7 @@ async def put_plant_file(desk: Desk, who: Person, order: orders.PlantFileOrder) 
 
 @_call("POST plant-file/waiting/{number}/approve", "plant file", ENGINEER)
 async def approve_plant_file(desk: Desk, who: Person, order: orders.OneChange) -> PlantFileStored:
-    """Approve another engineer's text, which is then stored; if that fails, it waits on."""
+    """Approve another engineer's text, which is then stored; if that fails, it waits again."""
     return await desk.operations.plant_file.approve(who, order.number)
 
 
@@ -781,7 +781,7 @@ def photograph(desk: Desk, order: orders.Picture) -> WithBlob:
 
 @_call("POST targets/{name}/photograph", "calibration", OPERATOR)
 async def take_photograph(desk: Desk, who: Person, order: orders.Named) -> CameraReading:
-    """Photograph a target now, with whatever beam is on it."""
+    """Photograph a target now, with or without a beam on it."""
     return CameraReading.of(await desk.operations.photograph(who, order.name))
 
 
@@ -813,7 +813,7 @@ def begin_marks(desk: Desk, who: Person, order: orders.Named) -> PictureToMark:
 
 @_call("GET pictures-to-mark/{identity}", "calibration", ENGINEER)
 async def picture_to_mark(desk: Desk, order: orders.KeptOne) -> WithBlob:
-    """Return a held picture as JPEG, as taken by the camera.
+    """Return a picture that is held for marking, as JPEG, as taken by the camera.
 
     The last four pictures are held.
     """
@@ -822,10 +822,11 @@ async def picture_to_mark(desk: Desk, order: orders.KeptOne) -> WithBlob:
 
 @_call("POST targets/{name}/marks", "calibration", ENGINEER, body=orders.Clicks)
 async def mark_corners(desk: Desk, who: Person, order: orders.Marks) -> MarksView:
-    """Test points clicked in a held picture: its `number`, and `points`, the pixels by point name.
+    """Test the points that a user has clicked in a held picture.
 
-    Returns residuals, notes, and the target as seen from the front. With `save`, which needs the
-    command authority, the camera uses the points from now on.
+    `number` is the number of the picture, and `points` contains the pixel coordinates of each
+    point by its name. Returns residuals, notes, and the target as seen from the front. With `save`,
+    which needs the command authority, the camera uses the points from now on.
     """
     token = desk.token_of(who) if order.save else None
     points = {name: (x, y) for name, (x, y) in order.points.items()}
@@ -862,7 +863,7 @@ async def take_flight(desk: Desk, who: Person, blob: bytes) -> views.FlightView:
 
 @_call("GET learning", "calibration", fresh=FRESH)
 def learning(desk: Desk) -> tuple[views.LearningView, ...]:
-    """Return what was learnt about each heliostat group, when, from what, and what is used."""
+    """Return what was learnt about each heliostat group, when, from what, and what is in use."""
     return desk.operations.automatic.learning.views()
 
 

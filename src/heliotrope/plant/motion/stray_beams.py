@@ -21,7 +21,7 @@ from heliotrope.plant.motion.defocusing import defocused
 from heliotrope.plant.motion.paths import Paths
 from heliotrope.safety import Act
 
-#: A heliostat at rest is included in one of this many checks.
+#: A heliostat at rest is checked only once in this many checks.
 TURNS = 3
 #: A heliostat moves if its counts and goals differ by more steps than the first number, and
 #: approaches its goal if it has made more steps than the second since the last check.

@@ -141,7 +141,7 @@ class AutomaticSettings:
     def __post_init__(self) -> None:
         if not (0.0 < self.beat <= 60.0 and self.margin >= 0.0):
             raise InputError(
-                f"automatic control: a cycle of {self.beat} s, a margin of {self.margin}; the "
+                f"automatic control: a cycle of {self.beat:g} s, a margin of {self.margin:g}; the "
                 "ranges are above 0 to 60 s, and 0 or more"
             )
         if self.losses < 0:

@@ -45,7 +45,7 @@ _BROKEN = (
     CalibrationOutcome.TAKEN_OUT,
     CalibrationOutcome.ERROR,
 )
-#: A heliostat that was on a target leaves it to others for this time, s.
+#: After a heliostat has been on a target, it leaves targets to other heliostats for this time, s.
 FRESH = 600.0
 #: Interval between computations of the true errors, s.
 _TRUTH_EVERY = 5.0

@@ -23,17 +23,17 @@ Mask = npt.NDArray[np.bool_]
 #: Function that returns the next of the ready heliostats (N,) for a target; True: in a joint visit.
 Next = Callable[[str, Mask, bool], PlannedVisit | None]
 
-#: Fraction of the largest expected error up to which automatic control sends a heliostat, because
-#: the sun moves until the visit begins.
+#: Automatic control sends a heliostat to a joint visit only if its expected error is at most this
+#: fraction of the largest permitted one, because the sun moves until the visit begins.
 _JOINT_SURE = 0.95
 #: Longest wait of a target for a joint first visit while the field is raised, s.
 _PATIENCE = 60.0
-#: Number of heliostats judged at a time, which takes some 10 ms.
+#: Number of heliostats judged without a break, which takes some 10 ms.
 _PART = 500
 #: Verdicts that indicate a fault of a heliostat or of what is believed about it.
 _WRONG = (Verdict.STUCK, Verdict.EXCHANGED, Verdict.ELSEWHERE)
-#: Fraction of the largest expected error up to which automatic control measures a heliostat on a
-#: receiver.
+#: Automatic control measures a heliostat on a receiver only if its expected error is at most this
+#: fraction of the largest permitted one.
 _RECEIVER_SURE = 0.75
 #: Receiver visits without a result, mostly because of the light and not of a heliostat.
 RECEIVER = RetryLaw(

@@ -20,8 +20,8 @@ from heliotrope.store.records import FieldPoint, Outlook
 
 #: Time between points of the actual curve, s, and number of points that are kept.
 POINT_EVERY, _POINTS = 60.0, 1500
-#: Smallest fraction of the measurable heliostats that must be ready for a prediction; below it the
-#: field is still being raised.
+#: Smallest fraction of the measurable heliostats that must be ready for a prediction. With fewer,
+#: the field is still being raised.
 _UP = 0.5
 _DAY = 86_400.0
 

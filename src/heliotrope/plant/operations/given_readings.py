@@ -16,7 +16,7 @@ from heliotrope.plant.orders.authority import Person
 OLDEST = 5.0
 #: A reading may be this far ahead of the plant's clock, as two clocks never agree fully, s.
 AHEAD = 0.5
-#: A user who sent no reading for this long is logged again on the next one, s.
+#: If a user has sent no reading for this long, the next one is logged, s.
 _SILENT = 10.0
 
 

@@ -37,10 +37,11 @@ from heliotrope.plant.workers import Worker
 
 #: Time for which a prediction is shown, and longest wait for the next prediction, s.
 EVERY, PATIENCE = 5.0, 5.0
-#: Time after the start during which the flux counts as unknown, s, as long as more than this share
-#: of the heliostats have not reported where they are.
+#: For this time after the start, s, the flux counts as unknown while more than this share of the
+#: heliostats have not reported where they are.
 FIRST, FEW = 60.0, 0.02
-#: Largest fraction of the power from beams with large errors for which a cell has an uncertainty.
+#: Largest fraction of the power that may come from beams with large errors. Above it, no
+#: uncertainty is computed for the cells.
 WIDE = 0.02
 _LIGHT = FieldOptics()
 

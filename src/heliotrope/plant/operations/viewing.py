@@ -26,7 +26,7 @@ from heliotrope.store.records import Kind
 _EVERY = 1.0
 #: An aim within this many half diagonals of the centre of a surface counts as on the surface.
 _NEAR = 1.0
-#: Supply voltage of a board that has not reported it yet, mV.
+#: Value that stands for the supply voltage of a board that has not reported it yet, mV.
 _UNTOLD = 0
 #: Number of names shown of the heliostats that have not carried out an emergency order.
 _SOME = 20

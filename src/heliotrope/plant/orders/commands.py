@@ -31,8 +31,8 @@ from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE
 
 #: Disk work, and the disk work that reverts it.
 Storing = tuple[Work, Callable[..., object]]
-#: Distance from all receivers, m. If two points are this far off and also this close together,
-#: moving between them brings no light to a receiver.
+#: If two points are at least this far from all receivers, m, and at most this far from each other,
+#: a beam that moves between them brings no light to a receiver.
 _BESIDE = 3.0
 
 

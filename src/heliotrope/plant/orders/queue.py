@@ -27,7 +27,8 @@ from heliotrope.safety import Act
 FORGOTTEN = 60.0
 #: Pause between repetitions of DEFOCUS and STOW to heliostats that have not acknowledged, s.
 REPEAT = 1.0
-#: Time that a cluster may need beyond a command's life to report that it failed, s.
+#: Time after the end of a command's life within which a cluster may still report that the command
+#: failed, s.
 GRACE = 3.0
 #: A command whose record is not on the disk within this time is not sent, s.
 RECORDING = 2.0

@@ -30,7 +30,7 @@ CHUNK, CHUNKS, MOST_CHUNKS = 64, 2, 6
 AGAIN = 300.0
 #: Maximum number of places in which a search looks for a beam.
 LOOKS = 25
-#: Slack of the screening, because a pivot is not at the foot of its heliostat, rad.
+#: Allowance in the screening for the distance between a heliostat's pivot and its foot, rad.
 SLACK = float(np.radians(4.0))
 
 Mask = npt.NDArray[np.bool_]

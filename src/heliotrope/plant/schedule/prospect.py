@@ -33,7 +33,8 @@ from heliotrope.sun import Site
 
 #: Shortest and longest interval of the predicted curve, s.
 _SHORT, _LONG = 120.0, 600.0
-#: A visit is assumed to take at most this many times the expected time, and at least the inverse.
+#: A visit is assumed to take at most this many times as long as expected, and at least the inverse
+#: of it.
 _MOST_PACE = 4.0
 #: Number of joint or receiver visits from which their actual times are used.
 _KNOWN = 3

@@ -40,7 +40,7 @@ from heliotrope.plant.schedule.prospect import (
 from heliotrope.plant.schedule.settings import Settings, Weather
 from heliotrope.safety import alarms
 
-#: A beam error this many times the expected error indicates that the heliostat has changed.
+#: If a beam error is this many times the expected error, the heliostat is assumed to have changed.
 SURPRISE = 3.0
 #: Number of visits from which their actual pace is used in a prediction.
 ENOUGH = 10

@@ -52,12 +52,13 @@ from heliotrope.plant.visits.verification import Confirming
 #: Function that moves beams to points on the surface, ENU, m, by heliostat.
 Move = Callable[[Mapping[str, FloatArray]], Awaitable[None]]
 
-#: Time in which each heliostat of a visit reports its step counts, because they are requested each
+#: Time within which each heliostat of a visit reports its step counts, s; they are requested every
 #: second.
 _COUNTED = 1.2
 #: Number of photographs that may wait for evaluation while the next is taken.
 _UNREAD = 2
-#: Fraction of the difference by which the usual light follows that of a new photograph.
+#: After each photograph, the light that counts as usual changes by this fraction of its difference
+#: from the light in the photograph.
 _FOLLOW = 0.2
 
 

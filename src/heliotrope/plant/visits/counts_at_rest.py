@@ -11,7 +11,8 @@ from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant.visits.visit import Visit
 
-#: Step counts that differ from the ordered movements by this fraction do not follow the movements.
+#: If step counts differ from the ordered movements by this fraction, the heliostat does not follow
+#: the movements.
 _FOLLOWS = 0.5
 #: Number of step-count reports that a sighting needs.
 _LEAST_ROWS = 3

@@ -35,7 +35,8 @@ from heliotrope.plant.visits.settings import CycleSettings
 #: Largest error of the last day's photographs that a fit with drift may leave, in sigma of a
 #: photograph: two axes, and the motion of the mirror within hours.
 EXPLAINED = 2.0
-#: A new fit may miss by more than the present one by this fraction of a sigma, added in quadrature.
+#: A new fit may leave larger errors than the present one by this fraction of a sigma, added in
+#: quadrature.
 ROOM = 0.25
 #: Outcomes of fits whose sightings contradict each other or the installation.
 WRONG = frozenset(

@@ -26,7 +26,8 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.coded_layout import Layout, SentBeam, beams_of, coded
 from heliotrope.plant.visits.expected_errors import expected_errors
 
-#: Distance of a beam from the border, in standard deviations of the beam and of its position.
+#: Smallest distance of a beam's centre from the edge of the target, in standard deviations of
+#: the beam's width and of its position.
 _BORDER, _PLACED = 2.0, 3.0
 #: Possible numbers of codes: for 8 to 256 photographs with movements along both axes, or for 8 to
 #: 128 with movements along one axis.

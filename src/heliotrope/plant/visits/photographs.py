@@ -26,8 +26,8 @@ from heliotrope.plant.visits.visit import Visit
 CORNERS = ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0))
 #: Number of spare photographs, because some may be cut off at the edge of the target.
 _SPARE = 2
-#: Light that was once absent where it was expected must have followed the aim this often to be
-#: used.
+#: If light was once absent where it was expected, it is used only after it has followed the aim
+#: this many times.
 _FOLLOWED = 2
 #: An aim this close to the previous one is not sent, m.
 _SAME = 0.05

@@ -12,8 +12,9 @@ from heliotrope.plant.controller import PlantController
 Rows = npt.NDArray[np.intp]
 
 #: Minimum size of a coded movement, in steps in which a beam follows its aim. Each end of a
-#: movement is off by at most half a step, so its size is off by a quarter. A beam whose movement
-#: differs by 0.3 from the movement of its light is taken for two beams (`imaging.coded`).
+#: movement is wrong by up to half a step, so a movement of this size is wrong by up to a quarter.
+#: If the movement of a beam differs by 0.3 from that of its light, the light is taken for that of
+#: two beams (`imaging.coded`).
 LEAST_STEPS = 2.0
 #: Number of steps over which a beam's motion is a straight line.
 _STRAIGHT = 10.0
