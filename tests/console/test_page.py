@@ -468,7 +468,8 @@ def test_the_head_fits_into_every_width(enter: Callable[[str], Any]) -> None:
         # Of all parts, the speed of a simulation gives way first.
         assert page.evaluate("""() => {
             const name = document.querySelector(".hx-name");
-            document.querySelector(".hx-head .hx-hint").textContent = "simulated at 2.0 × real time";
+            const hint = document.querySelector(".hx-head .hx-hint");
+            hint.textContent = "simulated at 2.0 × real time";
             return name.scrollWidth <= name.clientWidth;
         }"""), width
         assert page.evaluate("document.documentElement.scrollWidth") <= width
