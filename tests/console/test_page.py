@@ -465,6 +465,13 @@ def test_the_head_fits_into_every_width(enter: Callable[[str], Any]) -> None:
             assert beside or box["y"] >= stop["y"] + stop["height"], (width, part)
         for part in (".hx-head", ".hx-name", ".hx-tabs"):
             assert page.locator(part).evaluate("e => e.scrollWidth <= e.clientWidth"), (width, part)
+        # Of all parts, the speed of a simulation gives way first.
+        assert page.evaluate("""() => {
+            const name = document.querySelector(".hx-name");
+            const hint = document.querySelector(".hx-head .hx-hint");
+            hint.textContent = "simulated at 2.0 × real time";
+            return name.scrollWidth <= name.clientWidth;
+        }"""), width
         assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 

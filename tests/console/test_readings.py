@@ -59,7 +59,7 @@ def test_a_reading_reaches_the_safety_table_and_who_gave_it_is_recorded(
 @pytest.mark.parametrize(
     ("path", "value", "age", "status", "said"),
     [
-        ("readings/rain", 1.0, 0.0, 404, "there is no reading that programs give"),
+        ("readings/rain", 1.0, 0.0, 404, 'there is no "api" reading of the links file'),
         ("readings/receiver_flux_nominal", 0.0, 0.0, 404, "known: wind_gust"),
         (GUST, 3.0, 60.0, 422, "wind_gust: the reading is 6"),
         (GUST, 3.0, -60.0, 422, "ahead of the plant's clock"),

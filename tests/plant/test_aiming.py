@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from heliotrope.aims.heating import Heating
-from heliotrope.aims.rounds import forget
-from heliotrope.errors import InputError
+from heliotrope.aims.rounds import Heat, forget
+from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.aim_settings import AimSettings
 from heliotrope.field.flux_limit import FluxLimit
 from heliotrope.field.layouts import lay_out
@@ -23,6 +23,7 @@ from heliotrope.optics.surfaces import surface_of
 from heliotrope.plant.emergency import DNI_READING
 from heliotrope.plant.operations import aiming
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.views import Button
 from heliotrope.plant.orders.authority import Person, RefusedError, Role
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.workers import at_once
@@ -241,6 +242,27 @@ def test_a_limit_that_no_aims_hold_later_leaves_the_last_good_aims(
     played(scene)
 
 
+def test_beams_that_a_program_finds_leave_where_no_aims_ever_hold_the_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As after a restart with a wrong limit in the plant file."""
+
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        part = made.operations._aiming
+        monkeypatch.setattr(aiming.Aiming, "_allowed", lambda self, limit, scene: FluxLimit(100.0))
+        part._answer, part._source = None, ""
+        await asyncio.sleep(60.0)
+        assert made.operations.aims().source == ""
+        assert texts(made, "flux_above_limit", active=True)
+        assert true_flux(made).max() > 0.0
+        await asyncio.sleep(150.0)
+        assert made.operations.aims().source == "safe spread"
+        assert true_flux(made).max() == 0.0
+
+    played(scene, deadline=30.0)
+
+
 def test_heliostats_that_reach_no_cell_are_named_and_stay_at_standby() -> None:
     async def scene(made: LivePlant) -> None:
         await asyncio.sleep(90.0)
@@ -253,6 +275,82 @@ def test_heliostats_that_reach_no_cell_are_named_and_stay_at_standby() -> None:
         assert on.any()
 
     played(scene, sideways=True)
+
+
+def test_while_an_operator_commands_the_flux_is_watched_and_nothing_moves() -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        plant, operations = made.plant, made.operations
+        person = Person("Olga", Role.OPERATOR)
+        aims = tuple(sorted(operations.automatic.aims))
+        operations.automatic.give_way()
+        token = plant.take_authority(person).token
+        middle = plant.design.receivers[0].center
+        await operations.aim(person, token, dict.fromkeys(aims, middle)).end(30.0)
+        for _ in range(4):
+            await asyncio.sleep(5.0)
+            plant.authority.keep(person, token)
+        most, view = float(true_flux(made).max()), operations.aims()
+        assert most > LIMIT
+        assert view.idle == "Olga has the command authority"
+        assert view.at <= 16.0
+        assert view.peak == pytest.approx(most, rel=0.1)
+        assert view.reserve == pytest.approx(1.0 - view.peak / view.limit)
+        assert view.by_hand == aims
+        why = operations.why(aims[0])
+        assert why.text == (
+            f"{aims[0]} is TRACKING on receiver: an operator has aimed it, so its beam stays there"
+        )
+        assert why.button is Button.AUTOMATIC
+        (text,) = texts(made, "flux_above_limit", active=True)
+        assert "the predicted flux is up to" in text
+        np.testing.assert_allclose(
+            plant.aims[[plant.field.place(name) for name in aims]], [middle] * len(aims)
+        )
+        operations.emergency(person)
+        await asyncio.sleep(30.0)
+        view = operations.aims()
+        assert (view.peak, view.power) == (0.0, 0.0)
+        assert view.idle == "an emergency is active"
+        assert not texts(made, "flux_above_limit", active=True)
+
+    played(scene)
+
+
+def test_an_aim_is_refused_in_one_line_that_says_what_to_do() -> None:
+    async def scene(made: LivePlant) -> None:
+        first, second = made.names[:2]
+        points = made.operations._aiming.points
+        made.operations.automatic.aims.clear()
+        with pytest.raises(UnknownNameError, match="there is no heliostat 'X1'"):
+            points(("X1",))
+        with pytest.raises(InputError, match=rf"^aim {first}: no aim under the flux limit; give "):
+            points((first,))
+        with pytest.raises(InputError, match=rf"^aim {first} \(and 1 more\): no aim .* state the"):
+            points((first, second))
+
+    played(scene)
+
+
+def test_beams_on_the_receiver_do_not_count_as_at_rest() -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        aims = made.operations.automatic.aims
+        on = len(aims)
+        assert on > 1
+        # As at the start of a program, which has not chosen the aims of the beams that it finds.
+        aims.clear()
+        view = made.operations.aims()
+        assert view.aimed == on
+        assert view.resting <= COUNT - on
+
+    played(scene)
+
+
+def test_with_a_map_limit_and_flux_are_those_of_one_cell() -> None:
+    heat = Heat(np.array([[50.0, 10.0]]), np.zeros((1, 2)), np.array([[100.0, 11.0]]), 1.0)
+    assert heat.fullest == (10.0, 11.0)
+    assert heat.excess == pytest.approx(10.0 / 11.0 - 1.0)
 
 
 def test_without_answers_the_last_good_aims_stay_and_then_the_safe_spread(
@@ -343,6 +441,27 @@ def test_the_receiver_is_heated_in_steps_at_the_start_and_after_a_cloud() -> Non
             back = await watched(120.0)
             assert np.diff([cloud[-1], *back]).max() <= 1.3 * ramp
             assert back[-1] > 0.9 * up[-1]
+
+    played(scene, sensors=(DNI_READING,), ramp=ramp / every)
+
+
+def test_after_an_emergency_the_field_returns_along_the_ramp() -> None:
+    ramp, every = 30e3, 15.0
+
+    async def scene(made: LivePlant) -> None:
+        sky, person = Sky(made), Person("Olga", Role.OPERATOR)
+        async with sky.shining():
+            await asyncio.sleep(130.0)
+            before = await greatest(made, every)
+            assert before > 1.5 * ramp
+            made.operations.emergency(person)
+            await asyncio.sleep(150.0)
+            made.operations.withdraw(person)
+            await asyncio.sleep(5.0)
+            made.operations.resume(person)
+            back = [0.95 * await greatest(made, every) for _ in range(16)]
+            assert np.diff([0.0, *back]).max() <= 1.3 * ramp, back
+            assert back[-1] > 0.9 * before
 
     played(scene, sensors=(DNI_READING,), ramp=ramp / every)
 

@@ -75,8 +75,11 @@ def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() ->
         emergency = shown.why(name)
         assert "an emergency holds (Olga: smoke)" in emergency.text, emergency.text
         assert emergency.button is Button.WITHDRAW
+        assert emergency.remedy == "When the cause is gone, withdraw the order, then press Resume."
         shown.withdraw(OPERATOR)
-        assert shown.why(name).button is Button.RESUME, "somebody has to acknowledge"
+        withdrawn = shown.why(name)
+        assert withdrawn.button is Button.RESUME, "somebody has to acknowledge"
+        assert withdrawn.remedy == "When the cause is gone, press Resume."
         await asyncio.sleep(3.0)
         shown.acknowledge(OPERATOR, "operator_emergency")
         await asyncio.sleep(3.0)

@@ -109,22 +109,55 @@ class Move:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class Heat:
+    """Flux on the receiver, and its limit.
+
+    Attributes
+    ----------
+    flux, above, limit
+        Flux of the beams that shine now, what errors may add, and the limit less the margin, W/m²,
+        (rows, columns).
+    power
+        Power of the present aims, W.
+    """
+
+    flux: FloatArray
+    above: FloatArray
+    limit: FloatArray
+    power: float
+
+    @property
+    def excess(self) -> float:
+        """Largest ratio of the flux, including errors, to the limit, minus 1."""
+        return float(((self.flux + self.above) / self.limit).max()) - 1.0
+
+    @property
+    def fullest(self) -> tuple[float, float]:
+        """Flux including errors, and limit, of the cell with their largest ratio, W/m²."""
+        flux = self.flux + self.above
+        cell = np.unravel_index((flux / self.limit).argmax(), flux.shape)
+        return float(flux[cell]), float(self.limit[cell])
+
+    @property
+    def binding(self) -> int:
+        """Number of cells that the limit binds."""
+        return int((self.flux + self.above > BINDS * self.limit).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Answer(Heat):
     """Result of a round.
 
     Attributes
     ----------
+    flux, above, limit, power
+        See `Heat`.
     moves
         Moves, to be made one after the other.
     safe
         The safe spread: aims from the plant file for as many mirrors as the limit allows, (H, 3).
-    flux, above, limit
-        Flux of the beams that shine now, what errors may add, and the limit less the margin, W/m²,
-        (rows, columns).
     planned
         Power of the best aims, W.
-    power
-        Power of the present aims, W.
     gap
         Upper bound on the power that still better aims could add, as a fraction of the planned
         power.
@@ -138,25 +171,11 @@ class Answer:
 
     moves: tuple[Move, ...]
     safe: FloatArray
-    flux: FloatArray
-    above: FloatArray
-    limit: FloatArray
     planned: float
-    power: float
     gap: float
     left: int
     waiting: int = 0
     unlit: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
-
-    @property
-    def excess(self) -> float:
-        """Largest ratio of the flux, including errors, to the limit, minus 1."""
-        return float(((self.flux + self.above) / self.limit).max()) - 1.0
-
-    @property
-    def binding(self) -> int:
-        """Number of cells that the limit binds."""
-        return int((self.flux + self.above > BINDS * self.limit).sum())
 
 
 #: The last aims computed in this process, with the time of their images and the mirrors in these
@@ -207,18 +226,38 @@ def next_round(now: Round, **light: Any) -> Answer:
     risk = _risk(shown, now.demand, limit)
     safe = _safe(now, room, light)
     return Answer(
-        moves,
-        safe,
         shown.maps[0] + fixed,
         risk.above,
         limit,
-        better,
         power,
+        moves,
+        safe,
+        better,
         best.choice.gap,
         remaining,
         waiting,
         np.flatnonzero(now.free & (best.field.power.max(axis=1) <= 0.0)),
     )
+
+
+def heat(scene: Scene, demand: Demand, aims: FloatArray, **light: Any) -> Heat:
+    """Return the flux of beams at aims (H, 3), whoever has aimed them; NaN: no beam.
+
+    Parameters
+    ----------
+    scene, demand
+        See `Round`.
+    aims
+        Positions of the beams, ENU m.
+    **light
+        Arguments of `FieldFlux`.
+    """
+    rows, columns = surface_in(scene).shape
+    limit = demand.limit.on(rows, columns)
+    if not _aimed(aims).any():
+        return Heat(np.zeros_like(limit), np.zeros_like(limit), limit, 0.0)
+    engine = FieldFlux(_posed(scene, aims), **light)
+    return Heat(engine.maps[0], _risk(engine, demand, limit).above, limit, float(engine.powers[0]))
 
 
 def _room(now: Round, limit: FloatArray, light: dict[str, Any]) -> tuple[FloatArray, FloatArray]:

@@ -281,26 +281,39 @@ def aims(context: typer.Context, as_json: Json = False) -> None:
     if answer["strategy"] != "limit":
         print("aims from the plant file; no flux limit is set")
         return
+    _print_aims(answer)
+
+
+def _print_aims(answer: dict[str, Any]) -> None:
     if answer["problem"]:
         print(answer["problem"])
+    if answer["idle"]:
+        print(f"nothing is moved: {answer['idle']}")
     print(f"source of the aims: {answer['source'] or 'none yet'}")
     if answer["peak"] is not None:
+        share = answer["reserve"]
+        rest = f"{100 * share:.1f} % left" if share >= 0.0 else f"{-100 * share:.1f} % ABOVE it"
         print(
             f"limit {1e-3 * answer['limit']:.4g} kW/m², flux including errors up to "
-            f"{1e-3 * answer['peak']:.4g} kW/m², {100 * answer['reserve']:.1f} % left, "
-            f"{answer['binding']} cells at the limit"
+            f"{1e-3 * answer['peak']:.4g} kW/m², {rest}, "
+            f"{answer['binding']} cells at the limit, {answer['at']:.0f} s ago"
         )
-        print(f"{1e-3 * answer['power']:.5g} kW of {1e-3 * answer['planned']:.5g} kW")
+        best = answer["planned"]
+        print(
+            f"{1e-3 * answer['power']:.5g} kW"
+            + ("" if best is None else f" of {1e-3 * best:.5g} kW with the best aims")
+        )
     print(
-        f"{answer['aimed']} heliostats have an aim, {answer['resting']} are off the receiver "
-        f"because of the limit, {answer['left']} still have to move"
+        f"{answer['aimed']} heliostats have an aim, {answer['resting']} are at standby without "
+        f"one, {answer['waiting']} wait for the ramp, {answer['left']} still have to move"
     )
-    if answer["unlit"]:
-        names = answer["unlit"]
-        print(f"{len(names)} reach no cell of the receiver: {', '.join(names[:10])}")
-    if answer["moved"]:
-        names = answer["moved"]
-        print(f"{len(names)} moved {answer['moved_ago']:.0f} s ago: {', '.join(names[:10])}")
+    for names, text in (
+        (answer["by_hand"], "are aimed by an operator and stay"),
+        (answer["unlit"], "reach no cell of the receiver"),
+        (answer["moved"], f"moved {answer['moved_ago'] or 0.0:.0f} s ago"),
+    ):
+        if names:
+            print(f"{len(names)} {text}: {', '.join(names[:10])}")
 
 
 @app.command()
@@ -1438,12 +1451,17 @@ def _give(
 def _follow_with_authority(
     client: "Client | AtPlant", path: str, order: dict[str, Any] | None, wait: float
 ) -> None:
-    """Issue an order that needs the command authority, and follow the order to its end."""
+    """Issue an order that needs the command authority, and follow the order to its end.
+
+    An authority that this person holds already, as in a page, is kept.
+    """
+    held = client.get("authority")["mine"]
     client.ask("POST", "authority")
     try:
         _follow(client, client.ask("POST", path, order), wait)
     finally:
-        client.ask("DELETE", "authority")
+        if not held:
+            client.ask("DELETE", "authority")
 
 
 def _follow_all(client: "Client | AtPlant", tickets: list[dict[str, Any]], wait: float) -> None:

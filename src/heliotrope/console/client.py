@@ -70,6 +70,13 @@ class Client:
     def _request(self, method: str, path: str, body: Any) -> httpx.Response:
         try:
             answer = self._http.request(method, path.lstrip("/"), json=body)
+        except httpx.ReadTimeout:
+            after = "it is too busy; try again"
+            if method != "GET":
+                after = "the order may still take effect: look at the events before you repeat it"
+            raise RemoteError(
+                f"console {self._url}: no answer within {self._http.timeout.read:g} s; {after}"
+            ) from None
         except httpx.HTTPError as error:
             raise RemoteError(
                 f"console {self._url}: {str(error) or type(error).__name__}; is it running there?"

@@ -292,7 +292,7 @@ DRIVE_STALLED = Refusal(
 NOT_VERIFIED = Refusal(
     "not verified",
     "A heliostat is sent to the receiver while a calibration is verifying its new parameters.",
-    "a calibration has yet to verify its new parameters by a photograph",
+    "a calibration has yet to verify its new parameters by a photograph; wait until it has ended",
     "Wait until the visit has ended; DEFOCUS, STOW and LOCK end it at once.",
 )
 AIM_NOT_TAKEN = Refusal(

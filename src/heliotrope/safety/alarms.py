@@ -315,8 +315,10 @@ FLUX_ABOVE_LIMIT = AlarmKind(
     "The predicted flux with its errors, or the measured flux, is above the limit of the plant "
     "file.",
     "receiver {subject}: the {source} flux is up to {excess:.1f} % above its limit",
-    "The heliostats that heat this spot go to standby, and come back at other aims.",
-    "If it stays, defocus the heliostats that a person has aimed there.",
+    "Automatic control sends the heliostats that heat this spot to standby, and later to other "
+    "aims. Beams that an operator has aimed stay; while an operator has command, all stay.",
+    "Defocus the heliostats that an operator has aimed there, or return them (Automatic) and "
+    "release command.",
     over="receiver {subject}: the flux is within its limit",
 )
 RECORDS = AlarmKind(

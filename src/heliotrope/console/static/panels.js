@@ -96,16 +96,22 @@ export function plant(box) {
 // The flux limit, and how aims hold it; nothing where aims are spread.
 function aimsView(aims) {
   if (aims.strategy !== "limit") return [];
-  const share = (value) => value === null ? "–" : `${number(100 * value, 1)} %`, kilowatts = (value) => value === null ? "–" : number(value / 1e3, 0);
+  const share = (value) => value === null ? "–" : `${number(100 * value, 1)} %`, kilowatts = (value) => value === null ? "–" : number(value / 1e3, value > 0 && value < 1e4 ? 2 : 0);
+  const named = (names) => `${count(names.length)}: ${names.slice(0, 5).join(", ")}${names.length > 5 ? ", …" : ""}`;
   const sources = { optimiser: t("optimiser"), "last good aims": t("last good aims"), "safe spread": t("safe spread") };
-  return [h("h3", {}, t("Flux limit")), ...(aims.problem ? [h("p", { className: "hx-said bad" }, aims.problem)] : []), facts([
-    [t("Aims by"), sources[aims.source] ?? t("none yet")],
+  const above = aims.reserve !== null && aims.reserve < 0;
+  return [h("h3", {}, t("Flux limit")), ...(aims.problem ? [h("p", { className: "hx-said bad" }, aims.problem)] : []),
+    ...(aims.idle ? [h("p", { className: "hx-hint" }, t("Nothing is moved: {why}", { why: aims.idle }))] : []), facts([
+    [t("Aims by"), sources[aims.source] ?? t("none yet")], [t("Computed"), aims.at === null ? "–" : t("{age} ago", { age: span(aims.at) })],
     [t("Limit, and flux with its errors"), `${kilowatts(aims.limit)}, ${kilowatts(aims.peak)} kW/m²`],
-    [t("Left of the limit"), share(aims.reserve)], [t("Cells at the limit"), count(aims.binding)],
+    above ? [t("Above the limit"), share(-aims.reserve), "bad"] : [t("Left of the limit"), share(aims.reserve)], [t("Cells at the limit"), count(aims.binding)],
     [t("Power, and of the best aims"), `${kilowatts(aims.power)}, ${kilowatts(aims.planned)} kW`],
-    [t("With an aim, at rest for the limit, still to move"), `${count(aims.aimed)}, ${count(aims.resting)}, ${count(aims.left)}`],
-    ...(aims.unlit.length ? [[t("Reach no cell"), `${count(aims.unlit.length)}: ${aims.unlit.slice(0, 5).join(", ")}`]] : []),
-    [t("Moved last"), aims.moved.length ? t("{n}, {ago} ago: {names}", { n: count(aims.moved.length), ago: span(aims.moved_ago), names: aims.moved.slice(0, 5).join(", ") }) : t("none")]])];
+    [t("With an aim, at standby without one, still to move"), `${count(aims.aimed)}, ${count(aims.resting)}, ${count(aims.left)}`],
+    ...(aims.waiting ? [[t("Waiting for the ramp"), count(aims.waiting)]] : []),
+    ...(aims.by_hand.length ? [[t("Aimed by an operator"), named(aims.by_hand)]] : []),
+    ...(aims.unlit.length ? [[t("Reach no cell"), named(aims.unlit)]] : []),
+    [t("Moved last"), aims.moved.length ? t("{n}, {ago} ago: {names}", { n: count(aims.moved.length), ago: span(aims.moved_ago), names: aims.moved.slice(0, 5).join(", ") + (aims.moved.length > 5 ? ", …" : "") }) : t("none")]]),
+    h("p", { className: "hx-hint" }, t("For full sun and beams that hit their aims. Poorly calibrated beams are spread more, so the prediction above can be lower."))];
 }
 
 export function heliostat(box) {

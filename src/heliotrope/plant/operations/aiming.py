@@ -19,9 +19,11 @@ flux, so that the same moves relieve them.
 """
 
 import asyncio
+import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar, TypeVarTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +31,7 @@ import numpy.typing as npt
 from heliotrope.aims import Demand, SharedErrors
 from heliotrope.aims.candidates import surface_in
 from heliotrope.aims.heating import Heating
-from heliotrope.aims.rounds import Answer, Move, Round, next_round
+from heliotrope.aims.rounds import Answer, Heat, Move, Round, heat, next_round
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.field.flux_limit import FluxLimit
 from heliotrope.geometry import FloatArray, as_float
@@ -74,6 +76,8 @@ WARY = 600.0
 SAFE = 5.0
 
 Mask = npt.NDArray[np.bool_]
+T = TypeVar("T")
+Given = TypeVarTuple("Given")
 
 
 @dataclass(frozen=True)
@@ -87,33 +91,42 @@ class AimsView:
     source
         Where the present aims come from: "optimiser", "last good aims", "safe spread"; "" before
         the first aims.
+    idle
+        Why nothing is moved; empty if heliostats may be moved.
     at
-        Age of the last good computation, s; infinite before the first.
+        Age of the figures of the flux, s; infinite before the first.
     limit, peak
-        Lowest allowable flux less the margin, and highest predicted flux including its errors,
-        W/m².
+        Allowable flux less the margin, and predicted flux including its errors, W/m², in the cell
+        that is closest to its limit.
     reserve
-        Smallest fraction of the limit that remains unused in any cell; negative if the limit is
-        exceeded.
+        Fraction of the limit that remains unused in that cell; negative if the limit is exceeded.
     binding
         Number of cells in which the limit is binding.
     power, planned
-        Power with the present aims and with the best aims, W.
+        Power with the present aims and with the best aims, W; the best aims are not computed while
+        nothing is moved.
     gap
         Upper bound on the fraction of power that better aims could still add.
-    aimed, resting, left
-        Number of heliostats with an aim; number of wanted heliostats that the limit keeps at
-        standby; number of heliostats that still have to move.
+    aimed, resting
+        Number of heliostats that are on the receiver or have an aim there; number of wanted
+        heliostats at standby without an aim.
+    waiting
+        Number of heliostats at standby that only the ramp keeps from joining.
+    left
+        Number of heliostats that still have to move.
+    by_hand
+        Heliostats whose beams an operator has aimed, so that they stay where they are.
     unlit
         Heliostats that send no light to any cell of the receiver, wherever they aim.
     moved, moved_ago
-        Number of heliostats in the last move, and time since that move, s.
+        Heliostats in the last move, and time since that move, s.
     problem
         Why there are no new aims; empty if there are new aims.
     """
 
     strategy: str
     source: str = ""
+    idle: str = ""
     at: float = math.inf
     limit: float = math.nan
     peak: float = math.nan
@@ -124,7 +137,9 @@ class AimsView:
     gap: float = math.nan
     aimed: int = 0
     resting: int = 0
+    waiting: int = 0
     left: int = 0
+    by_hand: tuple[str, ...] = ()
     unlit: tuple[str, ...] = ()
     moved: tuple[str, ...] = ()
     moved_ago: float = math.inf
@@ -164,6 +179,8 @@ class Aiming:
         self._by_person: Mask = np.zeros(count, dtype=np.bool_)
         self._blocked_until = np.full(count, -math.inf)
         self._answer: Answer | None = None
+        self._heat: Heat | None = None
+        self._heat_at = -math.inf
         self._good_at = self._round_at = plant.now()
         self._moved: tuple[str, ...] = ()
         self._moved_at = -math.inf
@@ -200,6 +217,11 @@ class Aiming:
             return
         self._by_person |= np.isin(self._plant.field.names, names)
 
+    def by_hand(self, heliostat: str) -> bool:
+        """Return whether a beam stays where an operator has aimed it, under a flux limit."""
+        row = self._plant.field.place(heliostat)
+        return self._settings.limit is not None and bool(self._by_person[row])
+
     def points(self, heliostats: Sequence[str]) -> Mapping[str, FloatArray]:
         """Return the aims on the first receiver, ENU, m, (3,), by name.
 
@@ -207,37 +229,49 @@ class Aiming:
         ------
         InputError
             If a heliostat has no aim under the flux limit.
+        UnknownNameError
+            If there is no such heliostat.
         """
         if self._settings.limit is None:
             return self._plant.default_aims(heliostats)
-        aims = self._automatic.aims
-        without = [name for name in heliostats if name not in aims]
+        aims, place = self._automatic.aims, self._plant.field.place
+        without = [name for name in heliostats if place(name) >= 0 and name not in aims]
         if without:
+            more = f" (and {len(without) - 1:,} more)" if len(without) > 1 else ""
             raise InputError(
-                f"aim: {len(without)} heliostats, {without[0]} first, have no aim under the flux "
-                "limit; give them to automatic control, or leave them at standby"
+                f"aim {without[0]}{more}: no aim under the flux limit; give it to automatic "
+                "control, leave it at standby, or state the point on the receiver"
             )
         return {name: aims[name] for name in heliostats}
 
     def view(self) -> AimsView:
         """Return how aims are chosen now."""
-        settings, answer, now = self._settings, self._answer, self._plant.now()
-        movable, aims = self._automatic.movable(), self._automatic.aims
+        settings, now, field = self._settings, self._plant.now(), self._plant.field
         if settings.limit is None:
             return AimsView(settings.strategy)
-        aimed = sum(name in aims for name in self._plant.field.names)
+        aims, names, on = self._automatic.aims, np.array(field.names), self._on(now)
+        aimed = on | np.array([name in aims for name in field.names])
+        resting = self._automatic.movable() & ~aimed & field.among((states.IDLE,), now)
         made = AimsView(
-            settings.strategy, self._source, limit=float(np.min(settings.limit.flux)),
-            aimed=aimed, resting=max(int(movable.sum()) - aimed, 0), problem=self._problem,
+            settings.strategy, self._source, self._automatic.idle,
+            limit=(1.0 - settings.limit.margin) * float(np.min(settings.limit.flux)),
+            aimed=int(aimed.sum()), resting=int(resting.sum()), problem=self._problem,
+            by_hand=tuple(names[on & self._by_person].tolist()),
             moved=self._moved, moved_ago=now - self._moved_at,
         )  # fmt: skip
-        if answer is None:
+        heat, answer = self._heat, self._answer
+        if heat is None:
+            return made
+        peak, limit = heat.fullest
+        made = replace(
+            made, at=now - self._heat_at, limit=limit, peak=peak, reserve=-heat.excess,
+            binding=heat.binding, power=heat.power,
+        )  # fmt: skip
+        if answer is None or answer is not heat:
             return made
         return replace(
-            made, at=now - self._good_at, limit=float(answer.limit.min()),
-            peak=float((answer.flux + answer.above).max()), reserve=-answer.excess,
-            binding=answer.binding, power=answer.power, planned=answer.planned, gap=answer.gap,
-            left=answer.left, unlit=tuple(self._plant.field.names[row] for row in answer.unlit),
+            made, planned=answer.planned, gap=answer.gap, left=answer.left, waiting=answer.waiting,
+            unlit=tuple(names[answer.unlit].tolist()),
         )  # fmt: skip
 
     # -- running ---------------------------------------------------------------------------
@@ -248,10 +282,7 @@ class Aiming:
             return
         while True:
             begun = self._plant.now()
-            if self._automatic.idle:
-                self._good_at = begun  # nothing moves, so no aims are late
-            else:
-                await self._step(begun)
+            await self._step(begun)
             await self._pause(begun)
 
     async def _pause(self, begun: float) -> None:
@@ -265,69 +296,120 @@ class Aiming:
 
     @property
     def _waits_for_ramp(self) -> bool:
-        return self._answer is not None and self._answer.waiting > 0
+        answer = self._answer
+        return answer is not None and answer is self._heat and answer.waiting > 0
 
     async def _step(self, now: float) -> None:
         """Compute and send aims; after a failure the last good aims stay in force."""
+        if self._automatic.idle:
+            await self._stand_still(now)
+            return
         present = self._round(now)
         if not present.free.any():
-            self._good_at = now  # no heliostat may be moved, so no aims are late
+            await self._stand_still(now)
             return
+        try:
+            answer = await self._computed(next_round, present)
+        except HeliotropeError as error:
+            await self._failed(str(error))
+            await self._watch(now)
+            return
+        self._round_at = self._good_at = now
+        # A program that starts while beams are on the receiver must first see how hot it is.
+        blind = self._heating is not None and not self._heating.known and present.shining.any()
+        hot = self._measure(answer, now, present.scene.dni)
+        self._accept(answer)
+        self._warn(answer, now)
+        if hot:
+            await self._step(self._plant.now())
+        elif not blind:
+            await self._go(answer.moves)
+
+    async def _computed(self, work: Callable[[*Given], T], *given: *Given) -> T:
+        """Return a result of the worker.
+
+        Raises
+        ------
+        HeliotropeError
+            After any failure, because the plant goes on whatever fails here.
+        """
         try:
             # `asyncio.wait_for` of Python 3.11 may ignore that the program ends.
             async with asyncio.timeout(self._settings.deadline):
-                answer = await self._worker(next_round, present)
-        except TimeoutError:
-            await self._failed(f"no answer within {self._settings.deadline:g} s")
-        except HeliotropeError as error:
-            await self._failed(str(error))
-        except Exception as error:  # noqa: BLE001 - the plant goes on whatever fails here
-            await self._failed(f"{type(error).__name__}: {error}")
-        else:
-            self._round_at = self._good_at = now
-            # A program that starts while beams are on the receiver must first see how hot it is.
-            blind = self._heating is not None and not self._heating.known and present.shining.any()
-            hot = self._measure(answer, present)
-            self._take(answer, present)
-            if hot:
-                await self._step(self._plant.now())
-            elif not blind:
-                await self._go(answer.moves)
+                return await self._worker(work, *given)
+        except TimeoutError as error:
+            raise HeliotropeError(f"no answer within {self._settings.deadline:g} s") from error
+        except HeliotropeError:
+            raise
+        except Exception as error:
+            raise HeliotropeError(f"{type(error).__name__}: {error}") from error
 
-    def _measure(self, answer: Answer, present: Round) -> bool:
-        """Record the flux on the receiver, and by how much the measured flux exceeds the limit.
+    async def _stand_still(self, now: float) -> None:
+        """Only watch the flux in a round in which nothing may be moved, so that no aims are late.
 
-        Return whether the flux has only now been measured above the limit, so that the moves of
-        this round no longer suffice.
+        With a ramp, beams that have left lose their aims. The field would otherwise return to them
+        at once, for example after an emergency or a night.
+        """
+        self._good_at = now
+        if self._heating is not None:
+            aims, on, visiting = self._automatic.aims, self._on(now), self._automatic.visiting
+            for row, name in enumerate(self._plant.field.names):
+                if not on[row] and name not in visiting:
+                    aims.pop(name, None)
+        await self._watch(now)
+
+    async def _watch(self, now: float) -> None:
+        """Compare the flux with the limit where no aims are chosen, as while an operator commands.
+
+        If this fails, the last figures stay, with their age.
         """
         assert self._settings.limit is not None
-        self._beyond = [(at, beyond) for at, beyond in self._beyond if present.at - at <= WARY]
-        dni = self._measured_dni(present.at)
-        if not math.isfinite(dni):
+        scene, on = self._scene(now), self._on(now)
+        demand = self._demand(self._allowed(self._settings.limit, scene))
+        aims = np.where(on[:, None], self._plant.aims, np.nan)
+        with contextlib.suppress(HeliotropeError):
+            present = await self._computed(heat, scene, demand, aims)
+            self._measure(present, now, scene.dni)
+            self._warn(present, now)
+
+    def _measure(self, present: Heat, now: float, dni: float) -> bool:
+        """Record the flux on the receiver, and by how much the measured flux exceeds the limit.
+
+        The predicted flux is for an irradiance ``dni``, W/m². Return whether the flux has only now
+        been measured above the limit, so that the moves of this round no longer suffice.
+        """
+        assert self._settings.limit is not None
+        self._beyond = [(at, beyond) for at, beyond in self._beyond if now - at <= WARY]
+        measured = self._measured_dni(now)
+        if not math.isfinite(measured):
             return False
-        flux = as_float(answer.flux * (max(dni, 0.0) / present.scene.dni))
+        flux = as_float(present.flux * (max(measured, 0.0) / dni))
         if self._heating is not None:
-            self._heating.note(present.at, flux)
+            self._heating.note(now, flux)
         beyond = self._check.beyond(self._settings.limit, flux)
         if beyond is None:
             return False
-        self._beyond.append((present.at, beyond))
+        self._beyond.append((now, beyond))
         return len(self._beyond) == 1
 
-    def _take(self, answer: Answer, present: Round) -> None:
-        """Accept a result, and raise or clear the alarms about the limit and late aims."""
+    def _accept(self, answer: Answer) -> None:
+        """Accept new aims, which end the alarm about late aims."""
         self._answer, self._source = answer, "optimiser"
         if self._problem:
             self._problem = ""
             self._log.take_alarm(alarms.AIMS.ended())
+
+    def _warn(self, present: Heat, now: float) -> None:
+        """Raise or clear the alarm about the limit."""
+        self._heat, self._heat_at = present, now
         name, kind = self._plant.design.receivers[0].name, alarms.FLUX_ABOVE_LIMIT
-        fresh = [beyond for at, beyond in self._beyond if at >= present.at]
-        excess, source = (fresh[0].excess, "measured") if fresh else (answer.excess, "predicted")
+        fresh = [beyond for at, beyond in self._beyond if at >= now]
+        excess, source = (fresh[0].excess, "measured") if fresh else (present.excess, "predicted")
         above = bool(fresh) or excess > 0.01
         if above:
             self._log.take_alarm(kind.raised(name, source=source, excess=100.0 * excess))
         elif self._above:
-            self._log.take_alarm(alarms.FLUX_ABOVE_LIMIT.ended(name))
+            self._log.take_alarm(kind.ended(name))
         self._above = above
 
     def _ramp(self, now: float, scene: Scene) -> FloatArray | None:
@@ -370,16 +452,18 @@ class Aiming:
             self._log.take_alarm(alarms.AIMS.raised(problem=problem))
         self._problem = problem
         late = self._plant.now() - self._good_at
-        if self._answer is None:
-            return
         if late < SAFE * self._settings.deadline:
-            self._source = "last good aims"
+            self._source = "" if self._answer is None else "last good aims"
         elif self._source != "safe spread":
             self._source = "safe spread"
-            await self._to_safe(self._answer.safe)
+            nowhere = np.full((len(self._plant.field), 3), np.nan)
+            await self._to_safe(nowhere if self._answer is None else self._answer.safe)
 
     async def _to_safe(self, safe: FloatArray) -> None:
-        """Go to the safe spread; beams at other aims leave first, so that beams never overlap."""
+        """Go to the safe spread; beams at other aims leave first, so that beams never overlap.
+
+        Beams without an aim there (NaN) stay at standby.
+        """
         on = self._on(self._plant.now()) & self._movers(self._plant.now())
         apart = ~(np.linalg.norm(self._plant.aims - safe, axis=1) < 0.05)
         rows = np.flatnonzero(on & apart)

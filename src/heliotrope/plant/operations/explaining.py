@@ -14,9 +14,21 @@ from heliotrope.store.records import Kind
 #: Reason, what follows by itself, what an operator can do, and the command that does it.
 _Case = tuple[str, str, str, Button]
 
+_AIMED_BY_HAND = (
+    "an operator has aimed it, so its beam stays there",
+    "Press Automatic to return it to automatic control.",
+    Button.AUTOMATIC,
+)
+
 
 def explain(
-    plant: PlantController, automatic: AutomaticControl, logbook: Logbook, name: str, on: str
+    plant: PlantController,
+    automatic: AutomaticControl,
+    logbook: Logbook,
+    name: str,
+    on: str,
+    *,
+    by_hand: bool = False,
 ) -> Explanation:
     """Explain why a heliostat tracks or not.
 
@@ -28,6 +40,8 @@ def explain(
         Heliostat.
     on
         Receiver or target at which the heliostat aims; empty if there is none.
+    by_hand
+        Whether an operator has aimed it, so that the aims under the flux limit leave it there.
 
     Raises
     ------
@@ -41,6 +55,8 @@ def explain(
         and on in {receiver.name for receiver in plant.design.receivers}
     )
     why, follows, remedy, button = _case(plant, automatic, shown, tracks=tracks)
+    if tracks and by_hand and not why:
+        why, remedy, button = _AIMED_BY_HAND
     alarms = tuple(row for row in logbook.alarms() if row.subject == name and row.active)
     if alarms and not remedy:
         remedy = "See its alarm."
@@ -84,7 +100,9 @@ def _case(
         return (
             f"an emergency holds ({causes})",
             "Its beam stays off the receiver; after the emergency, nothing moves by itself.",
-            "When the cause is gone, withdraw the order, then press Resume.",
+            "When the cause is gone, "
+            + ("withdraw the order, then " if plant.sentinel.calls else "")
+            + "press Resume.",
             Button.WITHDRAW if plant.sentinel.calls else Button.RESUME,
         )
     if shown.state == "LOCKED":

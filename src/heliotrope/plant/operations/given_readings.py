@@ -62,7 +62,7 @@ class GivenReadings:
         """
         names = self._plant.settings.given
         if name not in names:
-            raise UnknownNameError("reading that programs give at this plant", name, sorted(names))
+            raise UnknownNameError('"api" reading of the links file', name, sorted(names))
         if not (math.isfinite(value) and math.isfinite(at)):
             raise InputError(f"{name}: {value} at {at} is not a reading; send finite numbers")
         age, now = self._plant.clock.utc().timestamp() - at, self._plant.now()

@@ -284,7 +284,8 @@ class Operations:
             If there is no such heliostat.
         """
         on = self.viewer.aim_names[int(self.viewer.frame().on[self.plant.field.place(heliostat)])]
-        return explain(self.plant, self.automatic, self.logbook, heliostat, on)
+        by_hand = self._aiming.by_hand(heliostat)
+        return explain(self.plant, self.automatic, self.logbook, heliostat, on, by_hand=by_hand)
 
     async def journal(self, query: JournalQuery) -> list[JournalEntry]:
         """Return the events, alarms and commands of all days, the latest first.
