@@ -29,6 +29,8 @@ ALIKE = 0.05
 PLACES = 9
 #: New aims are adopted if they add this fraction of power, or if the old aims exceed the limit.
 BETTER = 5e-3
+#: Share of the limit that counts as room where beams that stay leave none.
+LEAST = 0.02
 #: Excess over the limit that counts as zero, and the fraction of the limit from which a cell binds.
 HOLDS, BINDS = 3e-3, 0.99
 #: Maximum number of heliostats whose moves are examined in one round.
@@ -167,6 +169,8 @@ class Answer(Heat):
         Mirrors that only the ramp keeps from joining.
     unlit
         Free mirrors that send no light to any cell, wherever they aim, (K,).
+    problem
+        Why no aims respect the limit; empty if there are such aims.
     """
 
     moves: tuple[Move, ...]
@@ -176,6 +180,7 @@ class Answer(Heat):
     left: int
     waiting: int = 0
     unlit: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    problem: str = ""
 
 
 #: The last aims computed in this process, with the time of their images and the mirrors in these
@@ -198,20 +203,28 @@ def next_round(now: Round, **light: Any) -> Answer:
     **light
         Arguments of `FieldFlux`.
 
-    Raises
-    ------
-    InputError
-        If no aims respect the limit together with the beams that stay.
+    Returns
+    -------
+    Answer
+        If no aims respect the limit together with the beams that stay, its moves take mirrors off
+        the receiver until those that remain do.
     """
     rows, columns = surface_in(now.scene).shape
     limit = now.demand.limit.on(rows, columns)
     fixed, room = _room(now, limit, light)
-    best = _best(now, replace(now.demand, limit=type(now.demand.limit)(room)), light)
-    target_aims = np.where((now.free & ~best.defocused)[:, None], best.aims, np.nan)
+    demand = replace(now.demand, limit=type(now.demand.limit)(room))
+    best, target_aims, problem = None, now.aims, ""
+    try:
+        best = _best(now, demand, light)
+        target_aims = np.where((now.free & ~best.defocused)[:, None], best.aims, np.nan)
+    except InputError as error:
+        problem = _kept(now, fixed, limit) or str(error)
     engine = FieldFlux(_posed(now.scene, now.aims), **light)
     above = _risk(engine, now.demand, room).above
-    power, better = engine.powers[0], best.engine.powers[0]
-    cap = limit_cap = as_float(room - np.maximum(above, best.risk.above))
+    power = engine.powers[0]
+    better = power if best is None else best.engine.powers[0]
+    more = above if best is None else np.maximum(above, best.risk.above)
+    cap = limit_cap = as_float(room - more)
     full = ((engine.maps[0] + above) / room).max() > 1.0 + HOLDS
     if now.ramp is not None:
         # The ramp is no limit that must hold with a probability.
@@ -225,6 +238,7 @@ def next_round(now: Round, **light: Any) -> Answer:
     shown = FieldFlux(_posed(now.scene, np.where(now.shining[:, None], now.aims, np.nan)), **light)
     risk = _risk(shown, now.demand, limit)
     safe = _safe(now, room, light)
+    unlit = now.free & (best is not None and best.field.power.max(axis=1) <= 0.0)
     return Answer(
         shown.maps[0] + fixed,
         risk.above,
@@ -233,10 +247,11 @@ def next_round(now: Round, **light: Any) -> Answer:
         moves,
         safe,
         better,
-        best.choice.gap,
+        np.nan if best is None else best.choice.gap,
         remaining,
         waiting,
-        np.flatnonzero(now.free & (best.field.power.max(axis=1) <= 0.0)),
+        np.flatnonzero(unlit),
+        problem,
     )
 
 
@@ -263,25 +278,27 @@ def heat(scene: Scene, demand: Demand, aims: FloatArray, **light: Any) -> Heat:
 def _room(now: Round, limit: FloatArray, light: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
     """Return the flux of the beams that stay, and the room that they leave under the limit.
 
-    Raises
-    ------
-    InputError
-        If they leave none.
+    A fraction `LEAST` of the limit counts as room even where they leave none, so that mirrors which
+    heat other cells may stay.
     """
     fixed, room = np.zeros_like(limit), limit
-    stays = np.isfinite(now.fixed).all(axis=1)
-    if stays.any():
+    if _aimed(now.fixed).any():
         engine = FieldFlux(_posed(now.scene, now.fixed), **light)
         fixed = engine.maps[0]
         room = limit - fixed - _risk(engine, now.demand, limit).above
-        if (room <= 0.0).any():
-            raise InputError(
-                f"aims: {int(stays.sum())} beams whose aims are kept, by an operator or for their "
-                "return from a visit, bring up to "
-                f"{100.0 * float((1.0 - room / limit).max()):.0f} % of the limit; move some of "
-                "them, or raise the limit"
-            )
-    return fixed, as_float(room)
+    return fixed, as_float(np.maximum(room, LEAST * limit))
+
+
+def _kept(now: Round, fixed: FloatArray, limit: FloatArray) -> str:
+    """Return that beams which stay leave no room under the limit; empty if they leave some."""
+    most = float((fixed / limit).max())
+    if most <= 1.0 - LEAST:
+        return ""
+    return (
+        f"aims: {int(_aimed(now.fixed).sum())} beams whose aims are kept, by an operator or for "
+        f"their return from a visit, bring up to {100.0 * most:.0f} % of the limit; move some of "
+        "them, or raise the limit"
+    )
 
 
 def steps(

@@ -314,16 +314,19 @@ class Aiming:
             await self._failed(str(error))
             await self._watch(now)
             return
-        self._round_at = self._good_at = now
+        self._round_at = now
         # A program that starts while beams are on the receiver must first see how hot it is.
         blind = self._heating is not None and not self._heating.known and present.shining.any()
         hot = self._measure(answer, now, present.scene.dni)
-        self._accept(answer)
+        if not answer.problem:
+            self._accept(answer, now)
         self._warn(answer, now)
         if hot:
             await self._step(self._plant.now())
         elif not blind:
             await self._go(answer.moves)
+        if answer.problem:
+            await self._failed(answer.problem)
 
     async def _computed(self, work: Callable[[*Given], T], *given: *Given) -> T:
         """Return a result of the worker.
@@ -392,9 +395,9 @@ class Aiming:
         self._beyond.append((now, beyond))
         return len(self._beyond) == 1
 
-    def _accept(self, answer: Answer) -> None:
+    def _accept(self, answer: Answer, now: float) -> None:
         """Accept new aims, which end the alarm about late aims."""
-        self._answer, self._source = answer, "optimiser"
+        self._answer, self._source, self._good_at = answer, "optimiser", now
         if self._problem:
             self._problem = ""
             self._log.take_alarm(alarms.AIMS.ended())
