@@ -22,6 +22,7 @@ from heliotrope.aims.candidates import candidates, on_receiver
 from heliotrope.aims.optimiser import bound, optimise
 from heliotrope.aims.scene_aims import deviation
 from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.field.layouts import lay_out
 from heliotrope.geometry import normalize, reflect
 from heliotrope.optics.receiver_flux import FieldFlux
 from heliotrope.optics.scene import Scene
@@ -107,6 +108,14 @@ def test_the_bound_holds_and_the_choice_is_near_the_optimum_of_an_exact_solver()
     assert got.bound >= best * (1.0 - 1e-9)
     # A mirror is four per cent of this field's power.
     assert got.power > 0.97 * best
+
+
+def test_no_other_strategy_that_keeps_the_limit_passes_the_bound() -> None:
+    # Mirrors that aim aside block others, which the images do not show.
+    plant, when = lay_out("radial", 150), "2026-09-02T10:00Z"
+    best, middle = (ht.aim(plant, when, limit=5e7, strategy=name) for name in ("optimal", "middle"))
+    assert middle.excess < 0.0
+    assert middle.power <= best.power * (1.0 + best.gap)
 
 
 def test_prices_far_from_the_best_bound_it_too(scene: Scene, peak: float) -> None:
@@ -358,6 +367,12 @@ def test_a_plant_is_aimed_and_what_it_cannot_do_is_refused(tmp_path: Any) -> Non
     assert len((tmp_path / "aims.csv").read_text().splitlines()) == 19
     again = ht.aim(plant, sun=sun, limit=0.6 * middle.light.peak, start=got, cells=(12, 12))
     assert again.excess <= 0.0
+    with pytest.raises(InputError, match="start is for receiver receiver with 12 × 12 cells"):
+        ht.aim(plant, sun=sun, limit=1e6, start=got)
+    with pytest.raises(InputError, match="the start has 18 mirrors, but the scene has 12"):
+        ht.aim(lay_out("radial", 12), sun=sun, limit=1e6, start=got)
+    with pytest.raises(InputError, match="flux limit: pass a number in W/m²"):
+        ht.aim(plant, sun=sun, limit=[[1e6], [1e6, 2e6]])
     with pytest.raises(UnknownNameError, match="strategy"):
         ht.aim(plant, sun=sun, limit=1e6, strategy="midle")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="probability"):

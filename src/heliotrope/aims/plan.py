@@ -83,7 +83,7 @@ class AimPlan(Value, Framed):
     @property
     def gap(self) -> float:
         """Upper bound on the power that better aims could add, as a fraction; NaN if unknown."""
-        return self.scene.choice.gap
+        return self.scene.gap
 
     @property
     def excess(self) -> float:

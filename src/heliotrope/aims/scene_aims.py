@@ -127,6 +127,16 @@ class SceneAims:
         """Largest ratio of the quantile to the limit, minus 1; at most 0 if the limit holds."""
         return float((self.quantile / self.limit).max()) - 1.0
 
+    @property
+    def gap(self) -> float:
+        """Upper bound on the power that other candidates could add, as a fraction; NaN if unknown.
+
+        The fraction refers to the lower of two powers: the images', to which the bound belongs, and
+        the engine's, which includes shading and blocking at these aims.
+        """
+        power = min(self.choice.power, self.engine.powers[0])
+        return self.choice.bound / power - 1.0 if power > 0.0 else np.inf
+
     @cached_property
     def gain(self) -> FloatArray:
         """Power that a perfect calibration of each mirror would add, W, (H,)."""
@@ -179,6 +189,7 @@ def aim_scene(
         base.check_met()
         field = candidates(base)
     else:
+        _check_start(start, scene)
         base = FieldFlux(_posed(scene, start.aims, start.defocused), **light)
         field = _relit(start, base, scene)
     if strategy == "gradient":
@@ -293,13 +304,23 @@ def _posed(scene: Scene, aims: FloatArray, off: npt.NDArray[np.bool_] | None) ->
     return replace(scene, mirrors=scene.mirrors.toward(scene.sun, aims), dark=dark)
 
 
-def _relit(start: SceneAims, base: FieldFlux, scene: Scene) -> Candidates:
-    """Return earlier candidates rescaled to the present light."""
+def _check_start(start: SceneAims, scene: Scene) -> None:
+    """Refuse a start that belongs to other mirrors or to another receiver."""
     if len(scene.mirrors) != len(start.aims):
         raise InputError(
             f"aims: the start has {len(start.aims)} mirrors, but the scene has "
             f"{len(scene.mirrors)}; omit the start"
         )
+    was, now = surface_in(start.engine.scene), surface_in(scene)
+    if was.shape != now.shape or not np.allclose(was.center, now.center):
+        raise InputError(
+            f"aims: the start is for receiver {was.name} with {was.shape[0]} × {was.shape[1]} "
+            f"cells, not for {now.name} with {now.shape[0]} × {now.shape[1]}; omit the start"
+        )
+
+
+def _relit(start: SceneAims, base: FieldFlux, scene: Scene) -> Candidates:
+    """Return earlier candidates rescaled to the present light."""
     before, now = start.engine.leaving, base.leaving
     # A mirror that is defocused now or was then has no light of its own to compare; use the
     # field's.
