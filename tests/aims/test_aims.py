@@ -236,7 +236,7 @@ def test_along_a_ramp_no_cell_heats_faster_than_it_may(scene: Scene, held: Scene
         ramp_up(held, 0.0)
     with pytest.raises(InputError, match="more than 2000 steps"):
         ramp_up(held, 1e-3)
-    with pytest.raises(InputError, match="one beam alone heats a cell by .* raise the rate to"):
+    with pytest.raises(InputError, match="one beam alone heats a cell by"):
         ramp_up(held, peak / 600.0)
 
 

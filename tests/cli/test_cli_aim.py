@@ -149,7 +149,10 @@ def test_with_two_receivers_each_heliostat_counts_for_its_own(aim: Any) -> None:
         (("--limit=blank.csv",), "blank.csv: the file contains no numbers"),
         (("--limit=afd.csv",), "'temperature_c' is not a number; separate numbers in W/m²"),
         (("--limit=afd.csv", "--panels=panels.csv"), "afd.csv: line 3, column flux_w_m2: -80000"),
-        (("--limit=good.csv", "--panels=panels.csv"), "panel of path east: flux table: a temperature of 280 °C"),
+        (
+            ("--limit=good.csv", "--panels=panels.csv"),
+            "panel of path east: flux table: a temperature of 280 °C",
+        ),
         (("--limit=none.csv", "--panels=panels.csv"), "none.csv"),
         (("--limit=100", "--wanted=even"), "--wanted must be uniform"),
         (("--limit=100", "--time=now"), "--time or --sun"),

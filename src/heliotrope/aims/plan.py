@@ -18,6 +18,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray
 from heliotrope.optics.plant_flux import FieldOptics, PlantFlux, one_sun, result_of
+from heliotrope.optics.plant_scene import no_receiver
 from heliotrope.sun import Times
 from heliotrope.values import Card, Value, amount
 
@@ -209,7 +210,7 @@ def plan_aims(
         raise UnknownNameError("strategy", strategy, STRATEGIES)
     optics = (light or FieldOptics()).changed(changes)
     if not plant.receivers:
-        raise InputError(f"aims: plant {plant.name} has no receiver; add one to the plant file")
+        raise no_receiver(plant, "aims")
     chosen = receiver or plant.receivers[0].name
     middle = plant.receiver(chosen).center
     scene = optics.scene(plant, one_sun(plant, time, sun), middle, (chosen,))

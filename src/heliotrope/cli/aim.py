@@ -161,7 +161,7 @@ def aim(
         from heliotrope.calibration.plan.report import write_picture
         from heliotrope.plot import aim_figure
 
-        write_picture(picture, aim_figure(chosen))
+        write_picture(picture, aim_figure(*plans.values()))
     if as_json:
         print_json(_document(plans, chosen) | ({} if joins is None else {"joins_s": joins}))
         return
