@@ -258,6 +258,8 @@ def test_a_start_gives_aims_as_good_with_another_sun_and_without_a_mirror(
     assert warm.excess <= 0.0
     assert not (warm.engine.power[:10] > 0.0).any()
     assert warm.engine.powers[0] > 0.995 * cold.engine.powers[0]
+    again = aim_scene(scene, demand, start=warm)
+    assert again.engine.powers[0] > 0.995 * held.engine.powers[0], "the lost mirrors come back"
 
 
 def test_the_limit_holds_in_as_many_draws_of_true_errors_as_promised(

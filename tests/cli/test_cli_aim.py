@@ -106,6 +106,20 @@ def test_heliostats_that_reach_no_cell_are_named(aim: Any) -> None:
     assert not any(rows[name]["east_m"] for name in names)
 
 
+def test_lost_heliostats_and_clusters_send_no_light(aim: Any) -> None:
+    plant = ht.read_plant("plant.toml")
+    (cluster, *_), (name, *_) = plant.groups["azel"].cluster, plant.names[::-1]
+    gone = {*(n for n, c in zip(plant.names, plant.groups["azel"].cluster, strict=True)
+              if c == cluster), name}  # fmt: skip
+    code, out, err = aim("--limit=120", f"--without={cluster}", f"--without={name}", "--csv=a.csv")
+    assert code == 0, err
+    assert f"{len(gone)} heliostats are lost" in out
+    with Path("a.csv").open(encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    assert {row["heliostat"] for row in rows if row["state"] == "lost"} == gone
+    assert not any(float(row["power_kw"]) or row["up_m"] for row in rows if row["state"] == "lost")
+
+
 def test_with_two_receivers_each_heliostat_counts_for_its_own(aim: Any) -> None:
     plant = ht.read_plant("plant.toml")
     (first,) = plant.receivers
@@ -154,6 +168,7 @@ def test_with_two_receivers_each_heliostat_counts_for_its_own(aim: Any) -> None:
             "panel of path east: flux table: a temperature of 280 °C",
         ),
         (("--limit=none.csv", "--panels=panels.csv"), "none.csv"),
+        (("--limit=100", "--without=P6"), "there is no heliostat or cluster 'P6'; did you mean"),
         (("--limit=100", "--wanted=even"), "--wanted must be uniform"),
         (("--limit=100", "--time=now"), "--time or --sun"),
         (("--limit=100", "--receiver=other"), "other"),

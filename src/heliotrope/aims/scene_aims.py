@@ -100,6 +100,8 @@ class SceneAims:
         Aims, ENU m, (H, 3); the aims of defocused mirrors are at half height.
     defocused
         (H,).
+    dark
+        Mirrors that the scene had dark; they have no images, (H,).
     limit
         Allowable flux in each cell minus the margin, W/m², (rows, columns).
     risk
@@ -113,6 +115,7 @@ class SceneAims:
     choice: Choice
     aims: FloatArray
     defocused: npt.NDArray[np.bool_]
+    dark: npt.NDArray[np.bool_]
     limit: FloatArray
     risk: Risk
     light: dict[str, Any]
@@ -170,7 +173,8 @@ def aim_scene(
         it, and the others ignore it.
     start
         Aims of the same mirrors and receiver at another sun, irradiance or limit, or with other
-        mirrors in ``dark``: their images are used again, which takes a fraction of the time.
+        mirrors in ``dark``: their images are used again, which takes a fraction of the time. If a
+        mirror is no longer dark, all images are computed again.
     progress
         Called with the amount of work done and the total.
     **light
@@ -184,12 +188,12 @@ def aim_scene(
     """
     rows, columns = surface_in(scene).shape
     limit = demand.limit.on(rows, columns)
-    if start is None:
+    if start is None or not _usable(start, scene):
+        start = None
         base = FieldFlux(_posed(scene, middles(scene), None), **light)
         base.check_met()
         field = candidates(base)
     else:
-        _check_start(start, scene)
         base = FieldFlux(_posed(scene, start.aims, start.defocused), **light)
         field = _relit(start, base, scene)
     if strategy == "gradient":
@@ -304,8 +308,18 @@ def _posed(scene: Scene, aims: FloatArray, off: npt.NDArray[np.bool_] | None) ->
     return replace(scene, mirrors=scene.mirrors.toward(scene.sun, aims), dark=dark)
 
 
-def _check_start(start: SceneAims, scene: Scene) -> None:
-    """Refuse a start that belongs to other mirrors or to another receiver."""
+def _dark(scene: Scene) -> npt.NDArray[np.bool_]:
+    return np.zeros(len(scene.mirrors), dtype=np.bool_) if scene.dark is None else scene.dark
+
+
+def _usable(start: SceneAims, scene: Scene) -> bool:
+    """Return whether a start has images of all mirrors that are not dark.
+
+    Raises
+    ------
+    InputError
+        If it belongs to other mirrors or to another receiver.
+    """
     if len(scene.mirrors) != len(start.aims):
         raise InputError(
             f"aims: the start has {len(start.aims)} mirrors, but the scene has "
@@ -317,6 +331,7 @@ def _check_start(start: SceneAims, scene: Scene) -> None:
             f"aims: the start is for receiver {was.name} with {was.shape[0]} × {was.shape[1]} "
             f"cells, not for {now.name} with {now.shape[0]} × {now.shape[1]}; omit the start"
         )
+    return not (start.dark & ~_dark(scene)).any()
 
 
 def _relit(start: SceneAims, base: FieldFlux, scene: Scene) -> Candidates:
@@ -345,7 +360,7 @@ def _evaluated(
     aims = np.where(off[:, None], middles(scene), field.aims[rows, np.maximum(choice.choice, 0)])
     engine = FieldFlux(_posed(scene, aims, off), **light)
     risk = _risk(engine, field, demand, limit)
-    return SceneAims(engine, field, choice, aims, off, limit, risk, light)
+    return SceneAims(engine, field, choice, aims, off, _dark(scene), limit, risk, light)
 
 
 def _risk(engine: FieldFlux, field: Candidates, demand: Demand, limit: FloatArray) -> Risk:
@@ -384,7 +399,7 @@ def _ascended(
     choice = Choice(chosen, np.ascontiguousarray(prices.T), field.flux(chosen), power, np.nan)
     engine = FieldFlux(_posed(scene, aims, None), **light)
     off, risk = np.zeros(len(rows), dtype=np.bool_), _risk(engine, field, demand, limit)
-    return SceneAims(engine, field, choice, aims, off, limit, risk, light)
+    return SceneAims(engine, field, choice, aims, off, _dark(scene), limit, risk, light)
 
 
 def _place(scene: Scene, cell: tuple[int, ...]) -> str:
