@@ -149,3 +149,17 @@ def test_the_flux_of_a_field(tmp_path: Path) -> None:
     assert 60.0 < mean < 85.0
     assert found.charts == 2
     assert (tmp_path / "flux.nc").stat().st_size > 10_000
+
+
+def test_aims_under_a_flux_limit(tmp_path: Path) -> None:
+    pytest.importorskip("embreex")
+    found = Executed(EXAMPLES / "notebooks" / "aims.ipynb", tmp_path)
+    power = r" +(\d+) kW, peak +\d+ kW/m², with errors +(\d+) % of the limit"
+    middle, far = found.numbers(rf"middle{power}")
+    best, held = found.numbers(rf"optimal{power}")
+    assert held <= 100 < far
+    assert best > 0.98 * middle
+    (apart,) = found.numbers(r"rays give ([+-][\d.]+) % of the limit more")
+    assert abs(apart) < 1.0
+    assert found.numbers(r"at most ([\d.]+) % of the limit")[0] <= 100.0
+    assert found.charts == 2

@@ -182,6 +182,29 @@ def test_field_and_receiver_are_drawn_in_space(pyplot: object) -> None:
     assert len(figure.axes) == 5  # three pictures and two scales
 
 
+def test_each_strategy_is_drawn_beside_its_limit_and_excess_is_red(pyplot: object) -> None:
+    plant, sun = ht.example_plant(), (0.1, 0.6, 0.8)
+    pipe = replace(plant.receivers[0], kind="external_cylinder")
+    plans = [
+        ht.aim(replace(plant, receivers=(pipe,)), sun=sun, limit=8e4, strategy=name)
+        for name in ("middle", "optimal")
+    ]
+    figure = plot.aim_figure(*plans)
+    axes = [each for each in figure.axes if each.get_title()]
+    assert len(axes) == 4
+    titles = [each.get_title() for each in axes]
+    assert titles[0].startswith("middle, receiver: ")
+    assert titles[1] == f"middle, hottest cell {100 * plans[0].excess:.2f} % above its limit"
+    assert titles[3] == f"optimal, hottest cell {-100 * plans[1].excess:.2f} % below its limit"
+    assert {each.get_xlabel() for each in axes} == {"clockwise as seen from above, m"}
+    for each, plan in zip(axes[1::2], plans, strict=True):
+        (mesh,) = [c for c in each.collections if isinstance(c, QuadMesh)]
+        red = (mesh.to_rgba(mesh.get_array()) == (1.0, 0.0, 0.0, 1.0)).all(axis=-1)
+        assert red.sum() == (plan.quantile > 1.001 * plan.limit).sum()
+    assert plans[0].excess > 0.01
+    assert plans[1].excess <= 0.0
+
+
 @cache
 def in_a_cavity() -> ht.optics.PlantFlux:
     plant = ht.example_plant()

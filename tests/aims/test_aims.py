@@ -22,6 +22,7 @@ from heliotrope.aims.candidates import candidates, on_receiver
 from heliotrope.aims.optimiser import bound, optimise
 from heliotrope.aims.scene_aims import deviation
 from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.field.layouts import lay_out
 from heliotrope.geometry import normalize, reflect
 from heliotrope.optics.receiver_flux import FieldFlux
 from heliotrope.optics.scene import Scene
@@ -107,6 +108,14 @@ def test_the_bound_holds_and_the_choice_is_near_the_optimum_of_an_exact_solver()
     assert got.bound >= best * (1.0 - 1e-9)
     # A mirror is four per cent of this field's power.
     assert got.power > 0.97 * best
+
+
+def test_no_other_strategy_that_keeps_the_limit_passes_the_bound() -> None:
+    # Mirrors that aim aside block others, which the images do not show.
+    plant, when = lay_out("radial", 150), "2026-09-02T10:00Z"
+    best, middle = (ht.aim(plant, when, limit=5e7, strategy=name) for name in ("optimal", "middle"))
+    assert middle.excess < 0.0
+    assert middle.power <= best.power * (1.0 + best.gap)
 
 
 def test_prices_far_from_the_best_bound_it_too(scene: Scene, peak: float) -> None:
@@ -227,22 +236,24 @@ def test_a_wanted_map_draws_the_flux_to_it_and_the_limit_holds(
 
 def test_along_a_ramp_no_cell_heats_faster_than_it_may(scene: Scene, held: SceneAims) -> None:
     peak = float(held.engine.maps[0].max())
-    joins = ramp_up(held, peak / 600.0, 60.0)
+    joins = ramp_up(held, peak / 360.0, 60.0)
     assert np.isnan(joins).sum() == held.defocused.sum()
     before = np.zeros((18, 28))
     for k in range(round(np.nanmax(joins) / 60.0) + 1):
         here = joins <= 60.0 * k
         flux = FieldFlux(replace(held.engine.scene, dark=~here)).maps[0]
         # Heliostats that wait shade as those that shine.
-        assert flux.max() <= 1.005 * (k + 1) * peak / 10.0
+        assert (flux - before).max() <= 1.02 * peak / 6.0
         assert (flux >= before - 1e-3 * peak).all()
         before = flux
     assert before.max() == pytest.approx(peak, rel=1e-3)
-    assert 540.0 <= np.nanmax(joins) <= 900.0, "nearly as fast as the ramp"
+    assert 300.0 <= np.nanmax(joins) <= 600.0, "nearly as fast as the ramp"
     with pytest.raises(InputError, match="both must be above 0"):
         ramp_up(held, 0.0)
     with pytest.raises(InputError, match="more than 2000 steps"):
         ramp_up(held, 1e-3)
+    with pytest.raises(InputError, match="one beam alone heats a cell by"):
+        ramp_up(held, peak / 600.0)
 
 
 def test_a_map_binds_where_it_is_low(scene: Scene, peak: float) -> None:
@@ -263,6 +274,8 @@ def test_a_start_gives_aims_as_good_with_another_sun_and_without_a_mirror(
     assert warm.excess <= 0.0
     assert not (warm.engine.power[:10] > 0.0).any()
     assert warm.engine.powers[0] > 0.995 * cold.engine.powers[0]
+    again = aim_scene(scene, demand, start=warm)
+    assert again.engine.powers[0] > 0.995 * held.engine.powers[0], "the lost mirrors come back"
 
 
 def test_the_limit_holds_in_as_many_draws_of_true_errors_as_promised(
@@ -372,6 +385,12 @@ def test_a_plant_is_aimed_and_what_it_cannot_do_is_refused(tmp_path: Any) -> Non
     assert len((tmp_path / "aims.csv").read_text().splitlines()) == 19
     again = ht.aim(plant, sun=sun, limit=0.6 * middle.light.peak, start=got, cells=(12, 12))
     assert again.excess <= 0.0
+    with pytest.raises(InputError, match="start is for receiver receiver with 12 × 12 cells"):
+        ht.aim(plant, sun=sun, limit=1e6, start=got)
+    with pytest.raises(InputError, match="the start has 18 mirrors, but the scene has 12"):
+        ht.aim(lay_out("radial", 12), sun=sun, limit=1e6, start=got)
+    with pytest.raises(InputError, match="flux limit: pass a number in W/m²"):
+        ht.aim(plant, sun=sun, limit=[[1e6], [1e6, 2e6]])
     with pytest.raises(UnknownNameError, match="strategy"):
         ht.aim(plant, sun=sun, limit=1e6, strategy="midle")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="probability"):

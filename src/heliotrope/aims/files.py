@@ -26,6 +26,7 @@ def write_aims(path: str | Path, plan: AimPlan, joins: FloatArray | None = None)
         state = "out of reach" if plan.out_of_reach[k] else "aim"
         state = "reaches no cell" if unlit[k] else state
         state = "other receiver" if plan.elsewhere[k] else state
+        state = "lost" if plan.lost_mirrors[k] else state
         state = "defocus" if plan.defocused[k] else state
         aim = ["" if np.isnan(x) else f"{x:.4f}" for x in plan.aim[k]]
         more = () if joins is None else ("" if np.isnan(joins[k]) else f"{joins[k]:.0f}",)

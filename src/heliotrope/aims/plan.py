@@ -1,6 +1,6 @@
 """Aims of a plant's heliostats under a flux limit, and other strategies for comparison."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.frames import ENU, Framed, Labelled, Variable
 from heliotrope.geometry import FloatArray
 from heliotrope.optics.plant_flux import FieldOptics, PlantFlux, one_sun, result_of
+from heliotrope.optics.plant_scene import no_receiver
 from heliotrope.sun import Times
 from heliotrope.values import Card, Value, amount
 
@@ -39,6 +40,8 @@ class AimPlan(Value, Framed):
         Heliostats that cannot reach the receiver, (N,).
     elsewhere
         Heliostats that belong to another receiver, (N,).
+    lost_mirrors
+        Heliostats that are lost: out of service, or in a cluster that is, (N,).
     unlimited
         Power with every heliostat aimed at the middle of the receiver, W.
     scene
@@ -50,6 +53,7 @@ class AimPlan(Value, Framed):
     defocused: npt.NDArray[np.bool_]
     out_of_reach: npt.NDArray[np.bool_]
     elsewhere: npt.NDArray[np.bool_]
+    lost_mirrors: npt.NDArray[np.bool_]
     unlimited: float
     scene: SceneAims
 
@@ -61,14 +65,18 @@ class AimPlan(Value, Framed):
     @property
     def aim(self) -> FloatArray:
         """Aims, ENU m, (N, 3); NaN for heliostats that are not to light this receiver."""
-        off = self.defocused | self.out_of_reach | self.elsewhere | self.unlit
+        off = self.defocused | self._unable | self.unlit
         return np.where(off[:, None], np.nan, self.light.aim)
+
+    @property
+    def _unable(self) -> npt.NDArray[np.bool_]:
+        return np.asarray(self.out_of_reach | self.elsewhere | self.lost_mirrors)
 
     @property
     def unlit(self) -> npt.NDArray[np.bool_]:
         """Heliostats that send no light to any cell of the receiver, wherever they aim, (N,)."""
         dark = self.scene.field.power.max(axis=1) <= 0.0
-        return np.asarray(dark & ~self.out_of_reach & ~self.elsewhere)
+        return np.asarray(dark & ~self._unable)
 
     @property
     def power(self) -> float:
@@ -83,7 +91,7 @@ class AimPlan(Value, Framed):
     @property
     def gap(self) -> float:
         """Upper bound on the power that better aims could add, as a fraction; NaN if unknown."""
-        return self.scene.choice.gap
+        return self.scene.gap
 
     @property
     def excess(self) -> float:
@@ -157,6 +165,7 @@ def plan_aims(
     keep: bool = False,
     wanted: "FluxLimit | npt.ArrayLike | None" = None,
     give: float = 0.01,
+    without: Iterable[str] = (),
     start: AimPlan | None = None,
     progress: Step | None = None,
     light: FieldOptics | None = None,
@@ -190,9 +199,11 @@ def plan_aims(
         None: the most power, however it is distributed.
     give
         Fraction of the power that may be sacrificed for the wanted map, 0 to 0.5.
+    without
+        Names of lost heliostats and clusters, which send no light.
     start
-        A plan of the same plant and receiver for another sun position, irradiance or limit, from
-        which the search begins.
+        A plan of the same plant and receiver for another sun position, irradiance or limit, or with
+        other heliostats lost, from which the search begins.
     progress
         Called with the amount of work done and the total.
     light, **changes
@@ -203,33 +214,34 @@ def plan_aims(
     InputError
         As for `field_flux`, or if no aims respect the limit.
     UnknownNameError
-        If there is no receiver, option or strategy of that name.
+        If there is no receiver, option, strategy, heliostat or cluster of that name.
     """
     if strategy not in STRATEGIES:
         raise UnknownNameError("strategy", strategy, STRATEGIES)
     optics = (light or FieldOptics()).changed(changes)
     if not plant.receivers:
-        raise InputError(f"aims: plant {plant.name} has no receiver; add one to the plant file")
+        raise no_receiver(plant, "aims")
     chosen = receiver or plant.receivers[0].name
     middle = plant.receiver(chosen).center
     scene = optics.scene(plant, one_sun(plant, time, sun), middle, (chosen,))
-    others = _elsewhere(plant, chosen)
+    lost = _named(plant, without)
+    others = _elsewhere(plant, chosen) & ~lost
     beyond = np.zeros_like(others) if scene.dark is None else scene.dark
-    off = beyond | others
+    off = beyond | others | lost
     if off.all():
         belong = f", and {others.sum()} belong to other receivers" if others.any() else ""
+        belong += f", and {lost.sum()} are lost" if lost.any() else ""
         raise InputError(
             f"aims: none of the {len(plant)} heliostats can reach receiver {chosen}{belong}; "
             "choose another receiver or sun position"
         )
     scene = replace(scene, dark=off)
-    clusters = [name for group in plant.groups.values() for name in group.cluster]
     latitude = np.radians(plant.site.latitude_deg)
     demand = Demand(
         FluxLimit.of(limit),
         probability,
         shared or SharedErrors(),
-        np.unique(clusters, return_inverse=True)[1],
+        np.unique(_clusters(plant), return_inverse=True)[1],
         np.array([0.0, np.cos(latitude), np.sin(latitude)]),
         keep,
         None if wanted is None else FluxLimit.of(wanted),
@@ -241,7 +253,26 @@ def plan_aims(
     result = result_of(plant, aimed.engine.scene, aimed.engine)
     lit = aimed.field.power.max(axis=1) > 0.0
     defocused, unlimited = aimed.defocused & ~off & lit, aimed.field.middle_power
-    return AimPlan(strategy, result, defocused, beyond & ~others, others, unlimited, aimed)
+    beyond = beyond & ~others & ~lost
+    return AimPlan(strategy, result, defocused, beyond, others, lost, unlimited, aimed)
+
+
+def _clusters(plant: Plant) -> list[str]:
+    """Return the cluster of each heliostat; "" without one."""
+    return [name for group in plant.groups.values() for name in group.cluster]
+
+
+def _named(plant: Plant, names: Iterable[str]) -> npt.NDArray[np.bool_]:
+    """Return a mask of the heliostats that are named, or whose cluster is, (N,)."""
+    mask, clusters = np.zeros(len(plant), dtype=np.bool_), np.array(_clusters(plant))
+    heliostats = np.array(plant.names)
+    for name in names:
+        here = (heliostats == name) | ((clusters == name) & (clusters != ""))
+        if not here.any():
+            known = (*np.unique(clusters[clusters != ""]).tolist(), *plant.names)
+            raise UnknownNameError("heliostat or cluster", name, known)
+        mask |= here
+    return mask
 
 
 def _elsewhere(plant: Plant, receiver: str) -> npt.NDArray[np.bool_]:

@@ -13,10 +13,9 @@ MOST = 2_000
 def ramp_up(aims: SceneAims, rate: float, step: float = 60.0) -> FloatArray:
     """Return when each mirror joins the receiver, s after the start, (H,); NaN if it has no aim.
 
-    At the start of step k, counted from 0, mirrors join as long as the flux of no cell exceeds
-    k + 1 times the rise that one step allows; a mirror whose image alone exceeds this waits. For a
-    shut-down, mirrors leave along the same ramp in reverse order: a start-up time t becomes the
-    last time minus t.
+    At the start of each step, mirrors join as long as no cell gets more than the rise that one step
+    allows above its flux before the step. For a shut-down, mirrors leave along the same ramp in
+    reverse order: a start-up time t becomes the last time minus t.
 
     Parameters
     ----------
@@ -30,7 +29,8 @@ def ramp_up(aims: SceneAims, rate: float, step: float = 60.0) -> FloatArray:
     Raises
     ------
     InputError
-        If rate or step are not above 0, or the ramp has more than 2,000 steps.
+        If rate or step are not above 0, the ramp has more than 2,000 steps, or a single beam heats
+        a cell by more than one step allows.
     """
     if not (np.isfinite(rate) and rate > 0.0 and np.isfinite(step) and step > 0.0):
         raise InputError(f"ramp: {rate:g} W/m² per s in steps of {step:g} s; both must be above 0")
@@ -41,15 +41,22 @@ def ramp_up(aims: SceneAims, rate: float, step: float = 60.0) -> FloatArray:
     turn = (np.arange(count) * 0.6180339887498949) % 1.0
     # If neighbours joined one after the other, they would fill the same cells first.
     waiting = [int(row) for row in np.argsort(turn, kind="stable") if joining[row]]
-    flux, peak = np.zeros(images.shape[::-1]), float(aims.engine.maps[0].max())
+    peak = float(aims.engine.maps[0].max())
     if peak > MOST * rate * step:
         raise InputError(
             f"ramp: {1e-3 * peak:.4g} kW/m² take {peak / rate:.3g} s, more than {MOST} steps of "
             f"{step:g} s; raise the rate or the step"
         )
-    k = 0
+    hottest = max((float(images.of(row).max()) for row in waiting), default=0.0)
+    if hottest > rate * step:
+        raise InputError(
+            f"ramp: one beam alone heats a cell by {1e-3 * hottest:.4g} kW/m², more than the "
+            f"{1e-3 * rate * step:.4g} kW/m² that a step of {step:g} s allows; raise the rate to "
+            f"{1.01e-3 * 60.0 * hottest / step:.4g} kW/m² per minute"
+        )
+    flux, k = np.zeros(images.shape[::-1]), 0
     while waiting:
-        allowed, later = (k + 1) * rate * step, []
+        allowed, later = flux + rate * step, []
         for row in waiting:
             image = images.of(row)
             if (flux + image > allowed)[image > 0.0].any():

@@ -100,6 +100,8 @@ class SceneAims:
         Aims, ENU m, (H, 3); the aims of defocused mirrors are at half height.
     defocused
         (H,).
+    dark
+        Mirrors that the scene had dark; they have no images, (H,).
     limit
         Allowable flux in each cell minus the margin, W/m², (rows, columns).
     risk
@@ -113,6 +115,7 @@ class SceneAims:
     choice: Choice
     aims: FloatArray
     defocused: npt.NDArray[np.bool_]
+    dark: npt.NDArray[np.bool_]
     limit: FloatArray
     risk: Risk
     light: dict[str, Any]
@@ -126,6 +129,16 @@ class SceneAims:
     def excess(self) -> float:
         """Largest ratio of the quantile to the limit, minus 1; at most 0 if the limit holds."""
         return float((self.quantile / self.limit).max()) - 1.0
+
+    @property
+    def gap(self) -> float:
+        """Upper bound on the power that other candidates could add, as a fraction; NaN if unknown.
+
+        The fraction refers to the lower of two powers: the images', to which the bound belongs, and
+        the engine's, which includes shading and blocking at these aims.
+        """
+        power = min(self.choice.power, self.engine.powers[0])
+        return self.choice.bound / power - 1.0 if power > 0.0 else np.inf
 
     @cached_property
     def gain(self) -> FloatArray:
@@ -160,7 +173,8 @@ def aim_scene(
         it, and the others ignore it.
     start
         Aims of the same mirrors and receiver at another sun, irradiance or limit, or with other
-        mirrors in ``dark``: their images are used again, which takes a fraction of the time.
+        mirrors in ``dark``: their images are used again, which takes a fraction of the time. If a
+        mirror is no longer dark, all images are computed again.
     progress
         Called with the amount of work done and the total.
     **light
@@ -174,7 +188,8 @@ def aim_scene(
     """
     rows, columns = surface_in(scene).shape
     limit = demand.limit.on(rows, columns)
-    if start is None:
+    if start is None or not _usable(start, scene):
+        start = None
         base = FieldFlux(_posed(scene, middles(scene), None), **light)
         base.check_met()
         field = candidates(base)
@@ -295,13 +310,34 @@ def _posed(scene: Scene, aims: FloatArray, off: npt.NDArray[np.bool_] | None) ->
     return replace(scene, mirrors=scene.mirrors.toward(scene.sun, aims), dark=dark)
 
 
-def _relit(start: SceneAims, base: FieldFlux, scene: Scene) -> Candidates:
-    """Return earlier candidates rescaled to the present light."""
+def _dark(scene: Scene) -> npt.NDArray[np.bool_]:
+    return np.zeros(len(scene.mirrors), dtype=np.bool_) if scene.dark is None else scene.dark
+
+
+def _usable(start: SceneAims, scene: Scene) -> bool:
+    """Return whether a start has images of all mirrors that are not dark.
+
+    Raises
+    ------
+    InputError
+        If it belongs to other mirrors or to another receiver.
+    """
     if len(scene.mirrors) != len(start.aims):
         raise InputError(
             f"aims: the start has {len(start.aims)} mirrors, but the scene has "
             f"{len(scene.mirrors)}; omit the start"
         )
+    was, now = surface_in(start.engine.scene), surface_in(scene)
+    if was.shape != now.shape or not np.allclose(was.center, now.center):
+        raise InputError(
+            f"aims: the start is for receiver {was.name} with {was.shape[0]} × {was.shape[1]} "
+            f"cells, not for {now.name} with {now.shape[0]} × {now.shape[1]}; omit the start"
+        )
+    return not (start.dark & ~_dark(scene)).any()
+
+
+def _relit(start: SceneAims, base: FieldFlux, scene: Scene) -> Candidates:
+    """Return earlier candidates rescaled to the present light."""
     before, now = start.engine.leaving, base.leaving
     # A mirror that is defocused now or was then has no light of its own to compare; use the
     # field's.
@@ -326,7 +362,7 @@ def _evaluated(
     aims = np.where(off[:, None], middles(scene), field.aims[rows, np.maximum(choice.choice, 0)])
     engine = FieldFlux(_posed(scene, aims, off), **light)
     risk = _risk(engine, field, demand, limit)
-    return SceneAims(engine, field, choice, aims, off, limit, risk, light)
+    return SceneAims(engine, field, choice, aims, off, _dark(scene), limit, risk, light)
 
 
 def _risk(engine: FieldFlux, field: Candidates, demand: Demand, limit: FloatArray) -> Risk:
@@ -365,7 +401,7 @@ def _ascended(
     choice = Choice(chosen, np.ascontiguousarray(prices.T), field.flux(chosen), power, np.nan)
     engine = FieldFlux(_posed(scene, aims, None), **light)
     off, risk = np.zeros(len(rows), dtype=np.bool_), _risk(engine, field, demand, limit)
-    return SceneAims(engine, field, choice, aims, off, limit, risk, light)
+    return SceneAims(engine, field, choice, aims, off, _dark(scene), limit, risk, light)
 
 
 def _place(scene: Scene, cell: tuple[int, ...]) -> str:

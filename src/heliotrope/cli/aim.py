@@ -91,6 +91,9 @@ def aim(
             min=0.001, max=64000, help="Start-up: largest rise of flux, kW/m² per minute."
         ),
     ] = None,
+    without: Annotated[
+        list[str] | None, typer.Option(help="Lost heliostat or cluster; may be repeated.")
+    ] = None,
     drift_mrad: Annotated[
         float,
         typer.Option(min=0, max=50, help="Rotation common to all mirror normals, mrad per axis."),
@@ -143,6 +146,7 @@ def aim(
         "sun": None if sun is None else parse_sun(sun), "light": light, "limit": allowed,
         "probability": probability, "keep": keep_all,
         "wanted": _wanted(wanted), "give": 1e-2 * give_percent,
+        "without": tuple(without or ()),
         "shared": SharedErrors(1e-3 * drift_mrad, clock_s, 1e-3 * cluster_mrad),
     }  # fmt: skip
     names: tuple[Strategy, ...] = STRATEGIES if strategy == "all" else (strategy,)
@@ -161,7 +165,7 @@ def aim(
         from heliotrope.calibration.plan.report import write_picture
         from heliotrope.plot import aim_figure
 
-        write_picture(picture, aim_figure(chosen))
+        write_picture(picture, aim_figure(*plans.values()))
     if as_json:
         print_json(_document(plans, chosen) | ({} if joins is None else {"joins_s": joins}))
         return
@@ -271,6 +275,8 @@ def _print(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> None:
     print_table(
         header, rows, title=f"{chosen.light.plant}: aims on {chosen.light.maps[0].receiver}"
     )
+    if chosen.lost_mirrors.any():
+        print(f"{int(chosen.lost_mirrors.sum()):,} heliostats are lost")
     if chosen.elsewhere.any():
         print(f"{int(chosen.elsewhere.sum()):,} heliostats belong to other receivers")
     if chosen.unlit.any():

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.errors import FormatError, InputError
+from heliotrope.errors import FormatError, InputError, shown
 from heliotrope.files import write_text
 from heliotrope.files.text import read_text
 from heliotrope.geometry import FloatArray, as_float
 
 #: Largest flux that a limit may state, W/m²; the sun's own surface emits 6.3e7.
-_MOST = 6.4e7
+MOST = 6.4e7
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +38,11 @@ class FluxLimit:
                 f"flux limit: a map of shape {flux.shape}; pass one number, or an array with rows "
                 "and columns"
             )
-        wrong = ~((flux > 0.0) & (flux <= _MOST))
+        wrong = ~((flux > 0.0) & (flux <= MOST))
         if wrong.any():
             place = "" if flux.ndim == 0 else " in row {}, column {}".format(*np.argwhere(wrong)[0])
             raise InputError(
-                f"flux limit{place} must be above 0 and at most {_MOST:g} W/m², not "
+                f"flux limit{place} must be above 0 and at most {MOST:g} W/m², not "
                 f"{flux[wrong].flat[0]:g} W/m²"
             )
         if not 0.0 <= self.margin <= 0.5:
@@ -53,7 +53,15 @@ class FluxLimit:
     @classmethod
     def of(cls, limit: "FluxLimit | npt.ArrayLike") -> "FluxLimit":
         """Return a limit from a number or a map, W/m²."""
-        return limit if isinstance(limit, FluxLimit) else cls(as_float(limit))
+        if isinstance(limit, FluxLimit):
+            return limit
+        try:
+            flux = as_float(limit)
+        except (TypeError, ValueError):
+            raise InputError(
+                "flux limit: pass a number in W/m², or an array with rows and columns"
+            ) from None
+        return cls(flux)
 
     def on(self, rows: int, columns: int) -> FloatArray:
         """Return the allowable flux of each cell minus the margin, W/m², (rows, columns).
@@ -101,25 +109,11 @@ def read_limit(path: str | Path, margin: float = 0.0) -> FluxLimit:
     """
     rows: list[list[float]] = []
     for number, line in enumerate(read_text(path, "a flux limit").splitlines(), start=1):
-        cells = [cell for cell in line.strip().rstrip(",").split(",") if cell]
-        if not cells:
+        # Spreadsheets append commas to short lines.
+        cells = [cell.strip() for cell in line.strip().rstrip(",").split(",")]
+        if cells == [""]:
             continue
-        try:
-            rows.append([float(cell) for cell in cells])
-        except ValueError:
-            raise FormatError(
-                path, "a flux limit is a table of numbers in W/m², without a header",
-                where=f"line {number}",
-            ) from None  # fmt: skip
-        wrong = [k for k, x in enumerate(rows[-1], start=1) if not 0.0 < x <= _MOST]
-        if wrong:
-            raise FormatError(
-                path, (
-                    f"the flux must be above 0 and at most {_MOST:g} W/m², not "
-                    f"{rows[-1][wrong[0] - 1]:g} W/m²"
-                ),
-                where=f"line {number}, column {wrong[0]}",
-            )  # fmt: skip
+        rows.append([_flux(path, cell, number, k) for k, cell in enumerate(cells, start=1)])
         if len(rows[-1]) != len(rows[0]):
             raise FormatError(
                 path, (
@@ -128,7 +122,30 @@ def read_limit(path: str | Path, margin: float = 0.0) -> FluxLimit:
                 ),
                 where=f"line {number}",
             )  # fmt: skip
+    if not rows:
+        raise FormatError(path, "the file contains no numbers; enter W/m², one line per row")
     return FluxLimit(np.array(rows[::-1]), margin)
+
+
+def _flux(path: str | Path, cell: str, line: int, column: int) -> float:
+    """Return the allowable flux in one cell of a file."""
+    where = f"line {line}, column {column}"
+    if not cell:
+        raise FormatError(path, "the cell is empty; enter W/m²", where=where)
+    try:
+        flux = float(cell)
+    except ValueError:
+        raise FormatError(
+            path, (
+                f"{shown(cell)} is not a number; separate numbers in W/m² by commas, write decimal "
+                "points, and omit headers"
+            ),
+            where=f"line {line}",
+        ) from None  # fmt: skip
+    if not 0.0 < flux <= MOST:
+        what = f"the flux must be above 0 and at most {MOST:g} W/m², not {flux:g} W/m²"
+        raise FormatError(path, what, where=where)
+    return flux
 
 
 def write_limit(path: str | Path, limit: FluxLimit) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.flux_limit import FluxLimit
+from heliotrope.field.flux_limit import MOST, FluxLimit
 from heliotrope.files.cells import Rows, read_rows
 from heliotrope.geometry import FloatArray, as_float
 
@@ -139,7 +139,10 @@ def limit_of(table: FluxTable, panels: tuple[Panel, ...], margin: float = 0.0) -
     for panel in panels:
         along = height if panel.up else 1.0 - height
         temperature = panel.inlet + (panel.outlet - panel.inlet) * along
-        edges = table.at(as_float(temperature), np.full(_ROWS + 1, panel.velocity))
+        try:
+            edges = table.at(as_float(temperature), np.full(_ROWS + 1, panel.velocity))
+        except InputError as error:
+            raise InputError(f"panel of path {panel.path}: {error}") from None
         least = np.minimum(edges[:-1], edges[1:])[:, None]
         first = int(np.floor(panel.begin * _COLUMNS + 1e-6))
         columns = slice(first, int(np.ceil(panel.end * _COLUMNS - 1e-6)))
@@ -189,6 +192,7 @@ def read_flux_table(path: str | Path) -> FluxTable:
         rows.numbers(name, what)
         for name, what in zip(TABLE_COLUMNS, ("°C", "m/s", "W/m²"), strict=True)
     )
+    rows.within(TABLE_COLUMNS[2], flux, 1.0, MOST, "W/m²")
     rows.refuse_bad()
     axes = [np.unique(temperature), np.unique(velocity)]
     table = np.full((len(axes[0]), len(axes[1])), np.nan)

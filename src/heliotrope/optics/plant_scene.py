@@ -32,6 +32,12 @@ _PARTS = 8
 Focus = Literal["plant", "slant"] | float
 
 
+def no_receiver(plant: Plant, doing: str) -> InputError:
+    """Return the error for a plant without a receiver, such as one read from a layout."""
+    name = f"plant {plant.name}" if plant.name else "the field"
+    return InputError(f"{doing}: {name} has no receiver; write a plant file that contains one")
+
+
 def scene_of(
     plant: Plant,
     sun: npt.ArrayLike,
@@ -83,7 +89,7 @@ def scene_of(
         raise InputError(f"scene: the sun has the shape {light.shape}; pass one sun vector, (3,)")
     chosen = tuple(receivers) or plant.receivers
     if not chosen:
-        raise InputError(f"scene: plant {plant.name} has no receiver; add one to the plant file")
+        raise no_receiver(plant, "scene")
     surfaces = tuple(_surface(plant, item, cells) for item in chosen)
     ends = _aims(plant, surfaces[0].center, aim)
     tracking = track(plant, light, ends)

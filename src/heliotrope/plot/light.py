@@ -24,6 +24,8 @@ _FLUX, _SHARE = "inferno", "cividis"
 _MOST = 4000
 #: Lowest end of a scale of flux, kW/m², for receivers without light.
 _DARK = 1e-3
+#: Excess over the limit, as a fraction, that is not drawn as one.
+_HELD = 1e-3
 #: Maximum number of receivers beside a map of the field.
 _RECEIVERS = 3
 
@@ -68,9 +70,15 @@ def receiver_map(
         f"peak {1e-3 * view.flux.max():.4g} kW/m²",
         fontsize=10,
     )
-    ax.set_xlabel("right, m")
+    ax.set_xlabel(_across(view, surface))
     ax.set_ylabel("up, m")
     return ax
+
+
+def _across(view: FluxView, surface: Surface | None) -> str:
+    """Return the label of a map's columns; only those of a full cylinder are counted from 0."""
+    rounded = isinstance(surface, Cylinder) or view.right.min() >= 0.0
+    return "clockwise as seen from above, m" if rounded else "right, m"
 
 
 def standby_figure(plant: Plant, today: FloatArray, points: FloatArray) -> "Figure":
@@ -185,33 +193,55 @@ def flux_figure(found: PlantFlux, by: str = "total") -> "Figure":
     return figure
 
 
-def aim_figure(plan: AimPlan) -> "Figure":
-    """Return a figure of a plan's flux, its quantile relative to the limit, and active limits.
+def aim_figure(*plans: AimPlan) -> "Figure":
+    """Draw the flux of each plan and its quantile relative to the limit, one plan in each row.
+
+    White lines surround the cells that the limit binds; cells above the limit are red.
 
     Parameters
     ----------
-    plan
-        Result of `heliotrope.aim`.
+    *plans
+        One or more results of `heliotrope.aim`.
     """
     import matplotlib.pyplot as plt
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(13.0, 5.0), layout="constrained")
-    view = plan.light.maps[0]
-    receiver_map(view, ax=left)
-    share = 100.0 * plan.quantile / plan.limit
-    mesh = right.pcolormesh(
-        view.right, view.up, share, cmap=_SHARE, vmin=0.0, vmax=100.0, rasterized=True
+    count, first = len(plans), plans[0].light.maps[0]
+    tall = np.ptp(first.up) / max(float(np.ptp(first.right)), 1e-9)
+    height = float(np.clip(5.5 * tall + 0.9, 2.0, 5.0)) * count
+    figure, rows = plt.subplots(
+        count, 2, figsize=(13.0, height), layout="constrained", squeeze=False
     )
-    figure.colorbar(mesh, ax=right, label="quantile of the flux over the limit, %")
-    if plan.scene.binding.any():
-        binding = plan.scene.binding.astype(float)
-        right.contour(view.right, view.up, binding, levels=[0.5], colors="white")
-    right.set_aspect("equal", adjustable="box")
-    right.set_title(
-        f"{plan.strategy}: {100.0 * plan.excess:+.2f} % over the limit at most", fontsize=10
-    )
-    right.set_xlabel("right, m")
+    for plan, (left, right) in zip(plans, rows, strict=True):
+        view = plan.light.maps[0]
+        receiver_map(view, surface=plan.light.surfaces[0], ax=left)
+        left.set_title(f"{plan.strategy}, {left.get_title()}", fontsize=10)
+        _share_map(plan, right)
     return figure
+
+
+def _share_map(plan: AimPlan, ax: "Axes") -> None:
+    """Draw the quantile of a plan's flux relative to the limit."""
+    import matplotlib.pyplot as plt
+
+    view = plan.light.maps[0]
+    colours = plt.get_cmap(_SHARE).with_extremes(over="red")
+    mesh = ax.pcolormesh(
+        view.right, view.up, 100.0 * plan.quantile / plan.limit, cmap=colours, vmin=0.0,
+        vmax=100.0 * (1.0 + _HELD), rasterized=True,
+    )  # fmt: skip
+    extend = "max" if plan.excess > _HELD else "neither"
+    ax.figure.colorbar(mesh, ax=ax, label="flux quantile, % of limit", extend=extend)
+    if plan.scene.binding.any() and not plan.scene.binding.all():
+        binding = plan.scene.binding.astype(float)
+        ax.contour(view.right, view.up, binding, levels=[0.5], colors="white")
+    ax.set_aspect("equal", adjustable="box")
+    side = "above" if plan.excess > 0.0 else "below"
+    ax.set_title(
+        f"{plan.strategy}, hottest cell {100.0 * abs(plan.excess):.2f} % {side} its limit",
+        fontsize=10,
+    )
+    ax.set_xlabel(_across(view, plan.light.surfaces[0]))
+    ax.set_ylabel("up, m")
 
 
 def _front_view(surface: Mesh | Cavity, view: FluxView) -> Any:
