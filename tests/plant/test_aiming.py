@@ -135,6 +135,11 @@ def test_the_true_flux_holds_the_limit_which_the_middle_passes() -> None:
         assert view.reserve >= -0.005
         assert view.peak <= 1.005 * view.limit
         assert view.aimed >= 4
+        # Errors in cells at the limit cost power; those of beams elsewhere cost nothing.
+        worth = made.plant.worth
+        assert worth.mean() == pytest.approx(2.0)
+        assert worth.min() >= 1.0
+        assert worth.max() > 1.2 * worth.min()
 
     played(scene)
 

@@ -100,6 +100,26 @@ def test_the_best_is_chosen_of_all_that_can_be() -> None:
     assert value == pytest.approx(max(alone), rel=1e-9)
 
 
+def test_whose_error_costs_power_under_a_flux_limit_comes_first() -> None:
+    one = scheduler()
+    usual = ask(one)
+    assert usual is not None
+    assert "flux limit" not in usual.reason
+    row = PLANT.names.index(usual.heliostat)
+    other = (row + 12) % 24
+    worth = np.ones(24)
+    worth[other] = 50.0
+    one = scheduler()
+    one.weigh(worth)
+    told = ask(one)
+    assert told is not None
+    assert told.heliostat == PLANT.names[other]
+    assert "counts 50.0 times under the flux limit" in told.reason
+    one.cancel(told.heliostat)
+    coming = one.plan(MORNING, timedelta(hours=1), Standing.ready(24))
+    assert PLANT.names[other] in {planned.heliostat for planned in coming[:2]}
+
+
 def test_two_targets_get_two_heliostats() -> None:
     one = scheduler()
     first = ask(one, free_targets=("left",))

@@ -171,6 +171,9 @@ class Answer(Heat):
         Free mirrors that send no light to any cell, wherever they aim, (K,).
     problem
         Why no aims respect the limit; empty if there are such aims.
+    worth
+        Power that a smaller squared error of each mirror would add under the limit, W/rad², (H,);
+        empty if there are no aims.
     """
 
     moves: tuple[Move, ...]
@@ -181,6 +184,7 @@ class Answer(Heat):
     waiting: int = 0
     unlit: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     problem: str = ""
+    worth: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 #: The last aims computed in this process, with the time of their images and the mirrors in these
@@ -252,7 +256,14 @@ def next_round(now: Round, **light: Any) -> Answer:
         waiting,
         np.flatnonzero(unlit),
         problem,
+        np.zeros(0) if best is None else _worth(best),
     )
+
+
+def _worth(best: SceneAims) -> FloatArray:
+    """Return the power that a smaller squared error of each mirror would add, W/rad², (H,)."""
+    square = np.trace(best.engine.scene.mirrors.pointing, axis1=1, axis2=2)
+    return as_float(np.where(square > 0.0, best.gain / np.maximum(square, 1e-300), 0.0))
 
 
 def heat(scene: Scene, demand: Demand, aims: FloatArray, **light: Any) -> Heat:

@@ -332,6 +332,10 @@ class Scheduler:
         self._known.doubt(row, error**2 / expected)
         return True
 
+    def weigh(self, worth: FloatArray) -> None:
+        """Set how much a smaller squared error of each heliostat counts beside the others, (N,)."""
+        self._known.worth = worth
+
     def _find(self, heliostat: str) -> int:
         if heliostat not in self._known.row:
             raise UnknownNameError("heliostat", heliostat, self.names)
