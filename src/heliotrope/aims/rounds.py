@@ -170,7 +170,8 @@ class Answer(Heat):
     unlit
         Free mirrors that send no light to any cell, wherever they aim, (K,).
     problem
-        Why no aims respect the limit; empty if there are such aims.
+        Why no aims respect the limit together with the beams that stay; empty if there are such
+        aims.
     worth
         Power that a smaller squared error of each mirror would add under the limit, W/rad², (H,);
         empty if there are no aims.
@@ -210,8 +211,12 @@ def next_round(now: Round, **light: Any) -> Answer:
     Returns
     -------
     Answer
-        If no aims respect the limit together with the beams that stay, its moves take mirrors off
-        the receiver until those that remain do.
+        If beams that stay leave no room, its moves take other mirrors off the cells concerned.
+
+    Raises
+    ------
+    InputError
+        If no aims respect the limit, although all beams may move.
     """
     rows, columns = surface_in(now.scene).shape
     limit = now.demand.limit.on(rows, columns)
@@ -221,8 +226,9 @@ def next_round(now: Round, **light: Any) -> Answer:
     try:
         best = _best(now, demand, light)
         target_aims = np.where((now.free & ~best.defocused)[:, None], best.aims, np.nan)
-    except InputError as error:
-        problem = _kept(now, fixed, limit) or str(error)
+    except InputError:
+        if not (problem := _kept(now, fixed, limit)):
+            raise
     engine = FieldFlux(_posed(now.scene, now.aims), **light)
     above = _risk(engine, now.demand, room).above
     power = engine.powers[0]
