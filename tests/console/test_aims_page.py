@@ -85,7 +85,7 @@ def test_ctl_prints_what_the_page_shows(limited: None, ctl: Callable[..., str]) 
             "5 heliostats have an aim, 1 are off the receiver because of the limit, "
             "2 still have to move"
         ),
-        "1 reach no cell of the receiver: P0003A",
+        "reaching no receiver cell: 1, P0003A",
         "2 moved 12 s ago: P0001A, P0002A",
     ]
     told = json.loads(ctl("--json"))
