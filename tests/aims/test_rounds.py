@@ -101,7 +101,7 @@ def test_beams_that_a_person_has_aimed_stay_and_leave_less_room() -> None:
     assert true_flux(aims).max() <= 1.01 * limit
     fixed[:], free[:] = PLATE.center, False
     free[-1] = True
-    with pytest.raises(InputError, match="beams whose aims are kept"):
+    with pytest.raises(InputError, match="beams have fixed aims"):
         next_round(given(limit, NONE, fixed=fixed, free=free))
 
 

@@ -85,7 +85,10 @@ def test_table_and_airspace_file(
         (["--points", "8"], "has 8 unknowns; use 9 points or more"),
         (["--formats", "kml"], "--formats 'kml': choose from dji,qgc,litchi, or none"),
         (["--aircraft", "M4"], "there is no aircraft 'M4'"),
-        (["--elevations", "20"], "--elevations '20': use two angles from 0 to 90 degrees"),
+        (
+            ["--elevations", "20"],
+            "--elevations '20': use two angles from 0 to 90 degrees, such as 35,80",
+        ),
         (["--home", "1,2"], "--home '1,2': write three numbers"),
         (["--model", "malan"], "there is no model 'malan'"),
         (["--endurance", "10"], "duration '10': write it as"),

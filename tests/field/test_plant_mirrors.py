@@ -350,8 +350,8 @@ SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
         ("v 0 0 0\n", "the mesh has no faces"),
         ("v 0 0\n", "line 1: 'v 0 0': expected three coordinates in m"),
         (f"{SQUARE}f 1 2\n", "line 5: 'f 1 2': expected three vertex numbers or more"),
-        (f"{SQUARE}f 1 2 9\n", "a face has vertex 8, but there are only 4"),
-        (f"{SQUARE}f 1 1 2\n", "triangle 0 has no area; leave it out"),
+        (f"{SQUARE}f 1 2 9\n", "a face uses vertex 8, but there are only 4"),
+        (f"{SQUARE}f 1 1 2\n", "triangle 0 has no area; remove it"),
     ],
 )
 def test_a_mesh_that_cannot_be_is_one_line(content: str, text: str, tmp_path: Path) -> None:

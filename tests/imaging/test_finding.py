@@ -252,7 +252,7 @@ def test_marks_beyond_the_frame_are_missed_in_words() -> None:
     lost = only(render(scene(camera=replace(CAMERA, matrix=matrix)), 1).frame)
     assert not lost.found
     # Three on one line tell no plane.
-    assert lost.reason.startswith("its 8 marks were not found together; 3 shapes")
+    assert lost.reason.startswith("its 8 marks were not found in the right arrangement; 3 shapes")
 
 
 def test_what_was_seen_of_a_covered_target_is_said() -> None:

@@ -293,7 +293,7 @@ BAD: dict[str, tuple[bytes, str]] = {
     "png few rows": (_png(0, 8, (32, 20), ROWS[:300]), "this PNG is truncated"),
     "png text": (PNG[:33] + _flip(_chunk(b"tEXt", b"a\0b"), -1) + PNG[33:], "PNG is damaged"),
     "png small": (
-        _png(0, 8, (15, 20), ROWS), "15 × 20 px; an image must have at least 16 × 16 px or more"
+        _png(0, 8, (15, 20), ROWS), "15 × 20 px; an image must have at least 16 × 16 px"
     ),
     "png huge": (
         _huge(PNG), "10000 × 10000 px are 100 million, above the limit of 64 million; reduce"

@@ -237,8 +237,8 @@ def _room(now: Round, limit: FloatArray, light: dict[str, Any]) -> tuple[FloatAr
         room = limit - fixed - _risk(engine, now.demand, limit).above
         if (room <= 0.0).any():
             raise InputError(
-                f"aims: {int(stays.sum())} beams whose aims are kept, by an operator or for their "
-                "return from a visit, bring up to "
+                f"aims: {int(stays.sum())} beams have fixed aims, set by an operator or kept for "
+                "the return from a visit, and alone reach "
                 f"{100.0 * float((1.0 - room / limit).max()):.0f} % of the limit; move some of "
                 "them, or raise the limit"
             )

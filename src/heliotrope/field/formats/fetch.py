@@ -373,7 +373,7 @@ class _Run:
             return self._document(link)
         except NotFoundError:
             raise FetchError(
-                f"heliostat {link.heliostat}: {self.base} has no heliostat of this name"
+                f"heliostat {link.heliostat}: {self.base} has no heliostat with this name"
                 + self._suggestion(link.heliostat)
             ) from None
 
@@ -496,5 +496,5 @@ def _distinct(jobs: Iterable[RemoteFile]) -> list[RemoteFile]:
     for job in jobs:
         first = distinct.setdefault(job.path, job)
         if first.url != job.url:
-            raise FetchError(f"{job.url}: would be stored where {first.url} is; refused")
+            raise FetchError(f"{job.url}: would overwrite the file from {first.url}; refused")
     return list(distinct.values())

@@ -15,7 +15,7 @@ class Verdict(Enum):
     ELSEWHERE = "its beam is far from the expected place"
     JOINED = "its beam merges with other light"
     FAINT = "no light follows its code"
-    CLOUD = "too few photographs in the sun"
+    CLOUD = "too few photographs in sunlight"
 
 
 @dataclass(frozen=True)
