@@ -32,7 +32,7 @@ def test_each_person_has_a_share() -> None:
     assert admitted(admission, GRACE) == 3  # all have had eight
     with pytest.raises(BusyError, match=r"aim: too many orders of ada.*try again in 1 s"):
         admission.admit("aim", ADA)
-    with pytest.raises(BusyError, match="of all users"):
+    with pytest.raises(BusyError, match="from all users"):
         admission.admit("aim", Person("hedy", Role.ENGINEER))
     now[0] = 1.0
     assert admitted(admission, ADA) == 2

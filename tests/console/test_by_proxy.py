@@ -195,7 +195,7 @@ def test_an_account_of_any_name_is_disabled_and_has_no_factor_to_remove(
         own = {"own_password": PASSWORD}
         assert client.patch(path, json={"disabled": True, **own}).json()["name"] == name
         reset = client.post(f"{path}/password", json=own)
-        assert (reset.status_code, "signs in by the proxy" in reset.text) == (409, True)
+        assert (reset.status_code, "signs in through the proxy" in reset.text) == (409, True)
         factor = client.request("DELETE", f"{path}/factor", json=own)
         assert "set up your own second factor first" in factor.json()["detail"]
     account = console.keeper.people.account(name)

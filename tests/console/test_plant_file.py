@@ -113,7 +113,7 @@ def test_engineers_check_and_store_by_the_api(console: LiveConsole, ask: Ask) ->
     assert ask("engineer", "GET", f"plant-file/versions/{old['name']}").json() == text
     assert ask("engineer", "GET", "plant-file/versions/..%2F..").status_code == 404
     again = {"text": text, "version": view["version"], "reason": "not yet delivered"}
-    assert "uses these values already" in ask("engineer", "PUT", "plant-file", again).json()["text"]
+    assert "already uses these values" in ask("engineer", "PUT", "plant-file", again).json()["text"]
     assert '"PLANT FILE"' in (console.folder / "audit.jsonl").read_text()
 
 
@@ -156,7 +156,7 @@ def test_ctl_prints_checks_and_stores(console: LiveConsole, ctl: Ctl, tmp_path: 
     assert "new panel" in ctl("engineer", "plant-file", "--versions")
     name = versions(file)[-1].name
     assert ctl("engineer", "plant-file", "--version", name) == text
-    assert "no text is waiting" in ctl("engineer", "plant-file", "--waiting")
+    assert "no file is waiting" in ctl("engineer", "plant-file", "--waiting")
     assert "only one option" in ctl("engineer", "plant-file", "--versions", "--waiting", code=1)
     mine.write_text(text)
     ctl("engineer", *words)

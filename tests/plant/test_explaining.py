@@ -73,7 +73,7 @@ def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() ->
         shown.emergency(OPERATOR, reason="smoke")
         await asyncio.sleep(2.0)
         emergency = shown.why(name)
-        assert "an emergency holds (Olga: smoke)" in emergency.text, emergency.text
+        assert "an emergency is active (Olga: smoke)" in emergency.text, emergency.text
         assert emergency.button is Button.WITHDRAW
         shown.withdraw(OPERATOR)
         assert shown.why(name).button is Button.RESUME, "somebody has to acknowledge"

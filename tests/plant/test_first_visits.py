@@ -67,7 +67,7 @@ def test_new_mirrors_are_calibrated_and_verified_together() -> None:
         results = await here.run()
         assert results[stuck].outcome is CalibrationOutcome.NOT_PROVEN, results[stuck]
         assert results[false].outcome is _NOT_VERIFIED, results[false]
-        assert "the old parameters are back" in results[false].text
+        assert "the old parameters are in use again" in results[false].text
         for name in (stuck, false):
             assert plant.beliefs.record(name) is None
             assert plant.beliefs.known(name) is None

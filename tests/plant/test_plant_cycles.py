@@ -229,14 +229,14 @@ def test_a_visit_fits_the_rows_of_a_flight_with_its_photographs(tmp_path: Path) 
             {"azimuth_bias": 3e-3},
             (),
             CalibrationOutcome.IMPLAUSIBLE,
-            "deviations of its prior, above 0.01",
+            "prior standard deviations from its expected value, above the limit of 0.01",
         ),
         (
             {},
             {"tilt_east": 0.3},
             (),
             CalibrationOutcome.POOR_FIT,
-            "the fit leaves .* above 3 mrad",
+            "the fit leaves .* above the limit of 3 mrad",
         ),
         (
             {"least": 5},
@@ -257,7 +257,7 @@ def test_a_visit_fits_the_rows_of_a_flight_with_its_photographs(tmp_path: Path) 
             {"elevation_bias": 1e-3},
             (),
             CalibrationOutcome.NO_BETTER,
-            "the fit misses by .* not below 0.5 times",
+            "the fit leaves .* not below 0.5 times",
         ),
     ],
 )

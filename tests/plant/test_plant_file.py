@@ -188,7 +188,7 @@ def test_only_a_good_text_of_an_engineer_with_a_reason_is_stored(scene: Scene) -
         scene.store(TARGET, reason=" ")
     with pytest.raises(InputError, match=r"line 19: .*-3: .*nothing was stored"):
         scene.store(TOML.replace("width_m = 3", "width_m = -3"))
-    with pytest.raises(InputError, match="the same as the present file"):
+    with pytest.raises(InputError, match="the same as the current file"):
         scene.store(TOML)
     with pytest.raises(InputError, match="has changed since you opened it"):
         asyncio.run(scene.here.store(ENGINEER, TARGET, "0" * 12, "survey"))

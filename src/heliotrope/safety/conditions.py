@@ -81,7 +81,7 @@ def _orders() -> tuple[Condition, ...]:
         ),
         Condition(
             "flux_after_emergency", _PLANT, "flux_after_emergency", "share",
-            "flux on the receiver after an emergency order, of its nominal value",
+            "flux on the receiver after an emergency order, as a fraction of nominal",
             "flux on the receiver is {value} of nominal after an emergency order, or not known",
             0.10, 0.08, _STOW, _FIELD, _EMERGENCY, 300.0, role=_SUPERVISOR,
             release="the flux is gone, or the emergency is over",
@@ -113,7 +113,8 @@ def _receiver() -> tuple[Condition, ...]:
     return (
         Condition(
             "receiver_flux_high", _PLANT, "receiver_flux", "share",
-            "flux on the receiver, of its limit", "flux on the receiver is {value} of its limit",
+            "flux on the receiver as a fraction of its limit",
+            "flux on the receiver is {value} of its limit",
             1.0, 0.9, _DEFOCUS, _FIELD, _EMERGENCY, 30.0, delay=1.0, stale_after=5.0,
             clear_for=10.0, role=_OPERATOR, release="the flux is well below its limit",
             remedy="Let the receiver cool; return with fewer heliostats or other aim points.",
@@ -121,7 +122,7 @@ def _receiver() -> tuple[Condition, ...]:
         ),
         Condition(
             "receiver_temperature_high", _PLANT, "receiver_temperature", "share",
-            "temperature of the receiver, of its limit",
+            "temperature of the receiver as a fraction of its limit",
             "temperature of the receiver is {value} of its limit", 1.0, 0.95, _DEFOCUS, _FIELD,
             _EMERGENCY, 30.0, delay=1.0, stale_after=5.0, clear_for=60.0, role=_OPERATOR,
             release="the temperature is well below its limit",
@@ -129,7 +130,7 @@ def _receiver() -> tuple[Condition, ...]:
         ),
         Condition(
             "receiver_flow_low", _PLANT, "receiver_flow", "share",
-            "flow through the receiver, of its demand",
+            "flow through the receiver as a fraction of demand",
             "flow through the receiver is {value} of demand",
             0.8, 0.9, _DEFOCUS, _FIELD, _EMERGENCY, 30.0, delay=1.0, stale_after=3.0,
             clear_for=30.0, role=_OPERATOR, release="the flow is back",
@@ -214,7 +215,8 @@ def _links(autonomy: float) -> tuple[Condition, ...]:
             remedy="Check Mosquitto and the computer on which it runs.",
         ),
         Condition(
-            "bus_errors", _CLUSTER, "bus_errors", "share", "bad frames on the bus within 10 s",
+            "bus_errors", _CLUSTER, "bus_errors", "share",
+            "share of bad frames on the bus over 10 s",
             "{value} of the frames on the bus are bad",
             0.2, 0.05, _REFUSE, _BUS, _WARNING, 20.0, delay=5.0, clear_for=30.0,
             release="the bus is sound again",
@@ -223,7 +225,8 @@ def _links(autonomy: float) -> tuple[Condition, ...]:
             site=(0.02, 0.5),
         ),
         Condition(
-            "bus_failed", _CLUSTER, "bus_errors", "share", "bad frames on the bus within 10 s",
+            "bus_failed", _CLUSTER, "bus_errors", "share",
+            "share of bad frames on the bus over 10 s",
             "{value} of the frames on the bus are bad",
             0.9, 0.2, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=2.0,
             clear_for=30.0, release="the bus works again",
@@ -306,8 +309,8 @@ def _power_and_records() -> tuple[Condition, ...]:
         ),
         Condition(
             "database_unwritable", _PLANT, "audit_silence", "s",
-            "time since the audit last confirmed a write",
-            "the audit has not confirmed a write for {value}",
+            "time since the audit log last confirmed a write",
+            "the audit log has not confirmed a write for {value}",
             5.0, 2.0, _REFUSE, _FIELD, _SERIOUS, 10.0, ages=True, clear_for=5.0,
             release="writes are confirmed",
             remedy="Check the disk or the database; the alarm records gives the reason.",
@@ -333,7 +336,7 @@ def _mirrors() -> tuple[Condition, ...]:
             "its beam is on a receiver, but it was not sent there", 0.5, 0.4, _DEFOCUS, _HELIOSTAT,
             _SERIOUS, 30.0, then_stow=10.0, or_stow=True, delay=5.0,
             release="the beam is off the receiver",
-            remedy="If it stays, inspect the heliostat; to hold it, lock it at stow.",
+            remedy="If it stays there, inspect the heliostat; to hold it, lock it at stow.",
             site=(0.5, 0.5),
         ),
         Condition(
@@ -359,7 +362,7 @@ def _mirrors() -> tuple[Condition, ...]:
         ),
         Condition(
             "node_faults", _PLANT, "node_fault_share", "share",
-            "heliostats that failed within 600 s",
+            "share of the heliostats that failed within 600 s",
             "{value} of the heliostats failed within 600 s", 0.02, 0.01, _REFUSE, _FIELD,
             _WARNING, 20.0, delay=5.0, clear_for=60.0, role=_OPERATOR, release="few faults",
             remedy="Find what they share: a cluster, a supply, a firmware version.",
@@ -367,7 +370,7 @@ def _mirrors() -> tuple[Condition, ...]:
         ),
         Condition(
             "node_faults_many", _PLANT, "node_fault_share", "share",
-            "heliostats that failed within 600 s",
+            "share of the heliostats that failed within 600 s",
             "{value} of the heliostats failed within 600 s", 0.10, 0.05, _DEFOCUS, _FIELD,
             _SERIOUS, 30.0, delay=5.0, clear_for=60.0, role=_SUPERVISOR, release="few faults",
             remedy="Find at once what they share: a cluster, a supply, a firmware version.",

@@ -214,8 +214,8 @@ class Aiming:
         without = [name for name in heliostats if name not in aims]
         if without:
             raise InputError(
-                f"aim: {len(without)} heliostats, {without[0]} first, have no aim under the flux "
-                "limit; give them to automatic control, or leave them at standby"
+                f"aim: {len(without)} heliostats, the first {without[0]}, have no aim under the "
+                "flux limit; give them to automatic control, or leave them at standby"
             )
         return {name: aims[name] for name in heliostats}
 

@@ -82,9 +82,9 @@ def _case(
     if plant.sentinel.on:
         causes = "; ".join(f"{who}: {text}" for who, text in plant.sentinel.causes().items())
         return (
-            f"an emergency holds ({causes})",
+            f"an emergency is active ({causes})",
             "Its beam stays off the receiver; after the emergency, nothing moves by itself.",
-            "When the cause is gone, withdraw the order, then press Resume.",
+            "Once the cause is gone, withdraw the order, then press Resume.",
             Button.WITHDRAW if plant.sentinel.calls else Button.RESUME,
         )
     if shown.state == "LOCKED":

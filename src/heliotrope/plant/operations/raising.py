@@ -43,7 +43,7 @@ _UNCALIBRATED = (
     "it is not calibrated, and its beam could hit a target on the way to the receiver, so a visit "
     "to a target comes first"
 )
-_NO_AIM = "the flux limit leaves it no aim on the receiver"
+_NO_AIM = "the flux limit leaves no aim on the receiver for it"
 #: The next command of a heliostat on its way to the receiver, by its state.
 _NEXT = {states.STOWED: "APPROACH", states.DEFOCUSED: "IDLE", states.IDLE: "TRACK"}
 

@@ -200,7 +200,7 @@ class AlarmObserver(Judge):
             ends = max(since, rests.get(subject, inf), self._runs_since)
             passed = now - (max(ends, self._wrote_at) if kind == UNWRITTEN else ends)
             limit = self._by_faults.get(kind, inf)
-            saw = f"{kind} stands {passed:.0f} s after the last fault, limit {limit:g} s"
+            saw = f"{kind} is active {passed:.0f} s after the last fault, limit {limit:g} s"
             self.check(16, passed <= limit, now, subject, saw)
         for cluster, some in self._clusters.items():
             self._named_cluster(cluster, now)

@@ -84,9 +84,9 @@ SunAt = Callable[[float], FloatArray]
 
 #: Title of each invariant.
 TITLES = {
-    1: "no tracking on an old sun",
+    1: "no tracking with an outdated sun vector",
     2: "a heliostat that is cut off defocuses and stows",
-    3: "no way to tracking without a command",
+    3: "no tracking without a command",
     4: "DEFOCUS and STOW always, everything else by authority",
     5: "an old command moves nothing",
     6: "a damaged frame changes nothing",
@@ -100,13 +100,13 @@ TITLES = {
     14: "only a person resumes the field",
     15: "a proof counts only what is known",
     16: "work that is possible is done, and what is shown is true",
-    17: "what a person has ordered or locked stands",
-    18: "the true flux holds the limit",
+    17: "a person's orders and locks remain in force",
+    18: "the true flux stays within the limit",
     19: "each aim has an origin",
-    20: "what was taken is given back",
+    20: "whatever was taken is returned",
     21: "each ticket and each retry ends, truthfully",
     22: "every healthy mirror tracks again",
-    23: "what holds for safety outlives a restart",
+    23: "the state of safety survives a restart",
 }
 #: Numbers of the invariants about operators' orders and locks, the flux, and the origin of aims;
 #: numbers of the liveness invariants, which are called by name.

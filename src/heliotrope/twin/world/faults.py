@@ -14,8 +14,8 @@ from heliotrope.twin.world.worlds import OWN_FAULTS, pause_of, weights_of
 
 #: Everything that can go wrong: kind, weight in the random draw, and meaning.
 KINDS = {
-    "line_cut": (3, "plant and cluster do not hear each other"),
-    "line_one_way": (1, "one of them does not hear the other"),
+    "line_cut": (3, "plant and cluster cannot hear each other"),
+    "line_one_way": (1, "one of them cannot hear the other"),
     "line_drop": (2, "the connection breaks and both notice"),
     "line_bad": (3, "messages are lost, doubled, overtaken, damaged, delayed"),
     "plant_silent": (2, "the plant freezes"),
@@ -24,7 +24,7 @@ KINDS = {
     "nobody_there": (1, "nobody renews the command authority"),
     "cluster_crash": (3, "the cluster crashes and restarts later"),
     "bus_bad": (6, "frames are lost, damaged, doubled, delayed, late"),
-    "bus_stuck": (2, "a transmitter holds the line"),
+    "bus_stuck": (2, "a transmitter blocks the bus"),
     "bus_unplugged": (1, "the cluster's adapter is unplugged"),
     "power_cut": (6, "a board loses its supply at any instant"),
     "brown_out": (2, "a board loses its supply with a warning"),
@@ -33,15 +33,15 @@ KINDS = {
     "time_jump": (4, "the cluster's time jumps"),
     "time_lost": (2, "the cluster has no reliable time"),
     "replay": (8, "a recorded frame is sent again"),
-    "forgery": (6, "a stranger without authority and key commands"),
-    "stranger_safe": (3, "a stranger sends DEFOCUS or STOW"),
-    "noise": (4, "a stranger sends noise"),
+    "forgery": (6, "an intruder without authority or key sends commands"),
+    "stranger_safe": (3, "an intruder sends DEFOCUS or STOW"),
+    "noise": (4, "an intruder sends noise"),
 }
 #: Faults that occur only in some worlds, by name of the world.
 KINDS_OF_WORLDS = {
     "frozen": {
-        "cluster_frozen": (8, "the program of the cluster stands still, and goes on"),
-        "plant_frozen": (4, "the program of the plant stands still, and goes on"),
+        "cluster_frozen": (8, "the cluster's program freezes, then continues"),
+        "plant_frozen": (4, "the plant's program freezes, then continues"),
     },
     "twice": {"plant_twice": (8, "a second plant with the same keys runs")},
     "disk": {"disk_slow": (10, "the disk of the plant's records is slow")},
@@ -49,28 +49,28 @@ KINDS_OF_WORLDS = {
         "plant_crash": (6, "the plant crashes and restarts later"),
         "cluster_crash": (2, "the cluster crashes and restarts later"),
         "gust": (2, "a gust passes"),
-        "sensor_silent": (2, "a sensor shows nothing"),
+        "sensor_silent": (2, "a sensor gives no reading"),
         "sensor_jumps": (1, "a sensor jumps"),
     },
     "repairs": {
-        "board_exchanged": (6, "a spare board with another mirror's parameters is put in"),
+        "board_exchanged": (6, "a spare board with another mirror's parameters is installed"),
         "cluster_file": (
             4,
-            "a cluster restarts with a file in which a mirror is missing or named otherwise",
+            "a cluster restarts with a file in which a mirror is missing or has a different name",
         ),
         "plant_file": (2, "the plant restarts with another stow position in its file"),
         "plant_restored": (3, "the plant restarts with a backup of its store"),
-        "stall": (3, "the motors of a mirror stand still"),
+        "stall": (3, "the motors of a mirror stall"),
         "plant_crash": (5, "the plant crashes and restarts later"),
         "cluster_crash": (2, "the cluster crashes and restarts later"),
-        "line_cut": (1, "plant and cluster do not hear each other"),
+        "line_cut": (1, "plant and cluster cannot hear each other"),
         "power_cut": (2, "a board loses its supply at any instant"),
     },
     "sensors": {
-        "sensor_stuck": (3, "a sensor shows its last value for ever"),
+        "sensor_stuck": (3, "a sensor repeats its last value for ever"),
         "sensor_jumps": (2, "a sensor jumps"),
-        "sensor_silent": (3, "a sensor shows nothing"),
-        "sensor_nan": (2, "a sensor shows what is no number"),
+        "sensor_silent": (3, "a sensor gives no reading"),
+        "sensor_nan": (2, "a sensor gives something that is not a number"),
         "gust": (2, "a gust passes"),
     },
 }

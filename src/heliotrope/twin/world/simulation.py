@@ -891,7 +891,7 @@ def shrink(outcome: RunResult, most: int = 60) -> RunResult:
     """
     if outcome.good:
         raise InputError(
-            f"seed {outcome.plan.seed}: nothing is broken, so there is nothing to shrink"
+            f"seed {outcome.plan.seed}: no invariant was broken, so there are no faults to reduce"
         )
     number = outcome.violation.number if outcome.violation is not None else 0
     seconds = min(outcome.plan.seconds, outcome.seconds + 1.0)
