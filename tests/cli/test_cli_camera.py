@@ -503,7 +503,7 @@ def test_receiver_writes_nothing_where_it_refuses(call: Any, lit: Path, tmp_path
         (("none.toml", *given, "--out", out), "0 receivers; the flux camera needs a plant"),
         (("far.toml", *given, "--out", out), "position is unknown; specify --outline X,Y"),
         (("plant.toml", *given, "--out", tmp_path / "a.json"), "a reference is written as TOML"),
-        (("plant.toml", *given, "--lit", "four.png", "--out", out), "write FILE=SHARE"),
+        (("plant.toml", *given, "--lit", "four.png", "--out", out), "write FILE=FRACTION"),
         (
             ("plant.toml", *given, "--lit", f"{lit / 'four.png'}=0.9", "--out", out),
             "check the fractions",

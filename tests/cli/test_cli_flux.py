@@ -94,7 +94,7 @@ def test_a_receiver_beside_the_beams_gets_no_light(flux: Any) -> None:
 
     code, out, err = with_another(first.normal)
     assert code == 0, err
-    assert "beside: 0 MW, peak 0 kW/m², 0.00 % of the light" in out
+    assert "beside: 0 MW, peak 0 kW/m², 0.00 % of the reflected light" in out
     code, _, err = with_another(-first.normal)
     assert code == 2
     assert "receiver beside: no mirror sends light to it; turn the receiver" in err
@@ -182,8 +182,8 @@ def test_a_day_and_a_year_are_tables(flux: Any, tmp_path: Path) -> None:
         ((SUN, "--picture=p.gif"), "use one of"),
         ((SUN, "--csv=none/h.csv"), "the folder none does not exist"),
         ((SUN, "--csv=plant.toml"), "this file is an input"),
-        (("--year", "--time=now"), "--time: a year takes no --time"),
-        (("--year", "--rays=1e4"), "--rays: a year cannot be traced"),
+        (("--year", "--time=now"), "--time cannot be used with a year"),
+        (("--year", "--rays=1e4"), "--rays: a year cannot be ray-traced"),
         (("--every=1h", "--netcdf=f.nc"), "--netcdf: this file is written only for one time"),
     ],
 )

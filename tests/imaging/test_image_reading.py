@@ -381,7 +381,7 @@ def test_the_limit_is_an_argument(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"above the limit of 0\.0048 million"):
         read_image(path, limit=60 * 80 - 1)
     path.write_bytes(PNG + bytes(2**24 + 8 * 4800))
-    with pytest.raises(FormatError, match=r"MiB are more than 0\.0048 million pixels can have"):
+    with pytest.raises(FormatError, match=r"MiB are more than an image of 0\.0048 million pixels"):
         read_image(path, limit=4800)
 
 

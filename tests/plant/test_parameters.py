@@ -276,7 +276,7 @@ def test_a_board_that_has_started_anew_is_compared_before_its_mirror_moves(tmp_p
                 cluster.deaf.add(NAME)
                 cluster.rows[column][row] += 1
                 await bench.wait(2.0)
-                with pytest.raises(RefusedError, match="have not been compared with the wanted"):
+                with pytest.raises(RefusedError, match="have not been compared with the intended"):
                     plant.command(ENGINEER, token, "IDLE", (NAME,))
                 cluster.deaf.clear()
                 plant.authority.keep(ENGINEER, token)

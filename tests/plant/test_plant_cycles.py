@@ -413,7 +413,7 @@ def test_a_large_change_that_no_photograph_confirms_is_withdrawn(tmp_path: Path,
     for result in results:
         assert result.outcome is CalibrationOutcome.NOT_VERIFIED
         assert result.record is None
-        said = {"another light": "m from its predicted place", "cloud": "be used: cloud"}[why]
+        said = {"another light": "m from its predicted position", "cloud": "be used: cloud"}[why]
         assert said in result.text
 
 

@@ -343,7 +343,7 @@ def test_a_plant_leads_boards_on_pseudo_terminals(tmp_path: Path) -> None:
             MAIN, "run", str(folder / "plant.toml"), "--clusters", str(folder / "links.toml"),
             "--no-console", "--data", str(tmp_path / "data"), "--every", "1", "--automatic",
         )  # fmt: skip
-        plant.says("3 move to their aims")
+        plant.says("3 moving to their aims")
     finally:
         field.close()
         if plant is not None:

@@ -187,7 +187,7 @@ class _Order:
 def _refuse(what: str, any_of: dict[str, str | None], rays: float) -> None:
     for name, value in any_of.items():
         if value is not None:
-            raise InputError(f"{name}: {name} cannot be used with {what}; leave it out")
+            raise InputError(f"{name} cannot be used with {what}; leave it out")
     if rays:
         raise InputError(f"--rays: {what} cannot be ray-traced; specify one time")
 

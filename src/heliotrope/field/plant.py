@@ -111,8 +111,9 @@ class Plant(Value, Framed):
             _ = self.camera(self.receiver_visits.camera).pose
         if self.aims.limit is not None and len(self.receivers) != 1:
             raise InputError(
-                f"limit{len(self.receivers)}; remove [aims], and choose aims for one receiver at "
-                "a time with heliotrope aim"
+                'aims: strategy "limit" needs one receiver, and the plant has '
+                f"{len(self.receivers)}; remove [aims], and choose aims for one receiver at a time "
+                "with heliotrope aim"
             )
         if self.aims.limit is not None and self.receivers[0].mesh is not None:
             raise InputError(
