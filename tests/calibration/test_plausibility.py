@@ -194,9 +194,7 @@ MISTAKES = {
     "the motor of azimuth seems reversed": _reversed(0),
     "the motor of elevation seems reversed": _reversed(1),
     "both seem reversed": lambda s: replace(s, counts=-s.counts),
-    "its axes seem exchanged: the counts of azimuth": lambda s: replace(
-        s, counts=s.counts[:, ::-1]
-    ),
+    "its axes seem swapped: the counts of azimuth": lambda s: replace(s, counts=s.counts[:, ::-1]),
     "the azimuth of the sun seems to have the wrong sign": lambda s: replace(
         s, source=s.source * [-1.0, 1.0, 1.0]
     ),

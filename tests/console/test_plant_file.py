@@ -232,7 +232,7 @@ def test_a_camera_is_changed_on_the_page(
     page.fill("dialog [name=reason]", "back")
     page.click("dialog >> text='Store'")
     until(page, "text => document.querySelector('dialog .hx-told').textContent.includes(text)",
-          "used at once")  # fmt: skip
+          "takes effect immediately")  # fmt: skip
     assert file.read_text() == text
     # Nothing of the dialog is cut.
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")

@@ -51,12 +51,12 @@ def test_an_unknown_heliostat_is_named_with_its_neighbours(
     ):
         fetch_heliostats("AA93", tmp_path, base_url=database.base, settings=FAST)
     del database.files[f"/{PLANT}/{PLANT}-catalog-stac.json"]
-    with pytest.raises(FetchError, match="has no heliostat with this name; look at its catalogue"):
+    with pytest.raises(FetchError, match="has no heliostat with this name; see its catalogue"):
         fetch_heliostats("AA93", tmp_path, base_url=database.base, settings=FAST)
 
 
 def test_nothing_like_it_gets_no_suggestion(database: Database, tmp_path: Path) -> None:
-    with pytest.raises(FetchError, match=r"heliostat zzz: .*; look at its catalogue"):
+    with pytest.raises(FetchError, match=r"heliostat zzz: .*; see its catalogue"):
         fetch_heliostats("zzz", tmp_path, base_url=database.base, settings=FAST)
 
 

@@ -409,7 +409,7 @@ def test_a_defocus_that_takes_too_long_is_refused(tmp_path: Path) -> None:
     plant_file.read_plant(with_machine(tmp_path, slow))
     with pytest.raises(
         FormatError,
-        match=r"of heliostat A\d needs \d\d s to turn away by \d+\.\d°, and has only 20 s",
+        match=r"of heliostat A\d needs \d\d s to turn away by \d+\.\d°, but has only 20 s",
     ):
         plant_file.read_plant(
             with_machine(tmp_path, slow.replace("defocus_spread = 0", "defocus_spread = 4"))
@@ -521,7 +521,7 @@ def test_joint_visits_are_read_and_survive(tmp_path: Path) -> None:
         (
             "most = 25",
             "most = 200",
-            "joint_visits: joint visits: most (heliostats on one target at once) must be between",
+            "joint_visits: joint visits: most (maximum number of heliostats on one",
         ),
         ("most = 25", "most = 2.5", "joint_visits.most: "),
         ("known_mrad = 3", "known_mrad = 0", "known_mrad (largest"),

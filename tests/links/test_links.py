@@ -992,7 +992,7 @@ def test_a_place_that_is_taken_is_named() -> None:
     async def main() -> None:
         with socket.create_server(("127.0.0.1", 0)) as taken:
             plant = TcpServer("127.0.0.1", taken.getsockname()[1], {}, SystemClock())
-            with pytest.raises(LinkError, match="is another plant running there"):
+            with pytest.raises(LinkError, match="check whether another plant is running there"):
                 await plant.run()
 
     real(main)

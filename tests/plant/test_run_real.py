@@ -617,7 +617,7 @@ def test_an_address_that_is_taken_is_one_line(folder: Path) -> None:
         links = ("--clusters", folder / "links.toml", "--data", folder / "data", "--no-console")
         code, _, err = call(folder / "plant.toml", *links, "--minutes", 1)
     assert (code, err.count("\n")) == (2, 1)
-    assert "another plant running there?" in err
+    assert "another plant is running there" in err
 
 
 def test_a_port_of_the_console_that_is_taken_is_one_line() -> None:

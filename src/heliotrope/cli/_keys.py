@@ -153,7 +153,10 @@ def tls(
         raise InputError(f"{folder}: no such folder; create it so that only its owner can read it")
     if request:
         made = certificates.request(folder, name)
-        print(f"{made.certificate}: have it signed; the key {made.key} stays here")
+        print(
+            f"{made.certificate}: have it signed by your authority; the key {made.key} stays on "
+            "this computer"
+        )
         return
     made = certificates.certify(folder, name, parse_time("now"), days=days)
     print(f"{made.certificate}, {made.key}: pass them to heliotrope run as --certificate and --key")

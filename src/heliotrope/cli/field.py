@@ -183,7 +183,7 @@ def change(
         list[str] | None,
         typer.Argument(
             metavar="[NAME=VALUE]…",
-            help="New values; default: show the present values.",
+            help="New values; default: show the current values.",
             show_default=False,
         ),
     ] = None,

@@ -351,7 +351,7 @@ def print_spots(outcomes: "Sequence[Outcome]") -> None:
             for k, spot in enumerate(reading["spots"], start=1):
                 print(f"    spot {k}{_numbers(spot)}")
         for spot in outcome.document["beside_the_targets"]:
-            print(f"  beside the targets\n    spot  {_numbers(spot)}")
+            print(f"  outside the targets\n    spot  {_numbers(spot)}")
 
 
 def _numbers(spot: "dict[str, Any]") -> str:

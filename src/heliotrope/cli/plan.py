@@ -59,7 +59,10 @@ def plan(
         str, typer.Option(help="auto, jacks, malan8, guo6, khalsa8 or full.")
     ] = "auto",
     criterion: Annotated[
-        Literal["d", "v"], typer.Option(help="d: most information; v: smallest beam error.")
+        Literal["d", "v"],
+        typer.Option(
+            help=("What measurements are chosen for: d, most information; v, smallest beam error.")
+        ),
     ] = "d",
     sightings: Annotated[
         Path | None, typer.Option(help="Table of the sightings made so far.")

@@ -274,7 +274,7 @@ def check_front(plant: "Plant", heliostat: str, aim: Any, vertices: "np.ndarray"
         share = ahead[crossed] / (ahead[crossed] - beyond)
         if surface.holds(at[crossed] + share[:, None] * (aim - at[crossed])).any():
             raise InputError(
-                f"heliostat {heliostat}: {surface.name} stands between it and the aim; choose "
+                f"heliostat {heliostat}: {surface.name} is between it and the aim point; choose "
                 "another aim"
             )
 

@@ -128,8 +128,8 @@ class JointSettings(CodedSettings):
 
     kind: ClassVar[str] = "joint visits"
 
-    most: int = _number(49, "heliostats on one target at once", 2, 127)
-    least: int = _number(4, "fewest heliostats for which automatic control starts a visit", 2, 127)
+    most: int = _number(49, "maximum number of heliostats on one target at once", 2, 127)
+    least: int = _number(4, "minimum number of heliostats for a visit by automatic control", 2, 127)
     movement: float = _number(
         0.5,
         "coded movement of a beam, in both directions along each axis",
@@ -139,12 +139,12 @@ class JointSettings(CodedSettings):
         above=True,
     )
     again: float = _number(
-        2.5, "most photographs, as a multiple of the number that a visit needs", 1
+        2.5, "maximum number of photographs, as a multiple of the number that a visit needs", 1
     )
     brightest: float = _number(10.0, "maximum irradiance on a target", 0, unit="suns", above=True)
     first: int = _number(
         15,
-        "most heliostats without a calibration at once; 0: measure each of them separately",
+        "maximum number of heliostats without a calibration at once; 0: measure each separately",
         0,
         127,
     )
@@ -177,8 +177,8 @@ class ReceiverSettings(CodedSettings):
 
     camera: str = field(kw_only=False)
     receiver: str = field(kw_only=False)
-    most: int = _number(50, "heliostats at once", 1, 127)
-    least: int = _number(8, "fewest heliostats for which automatic control starts a visit", 1, 127)
+    most: int = _number(50, "maximum number of heliostats at once", 1, 127)
+    least: int = _number(8, "minimum number of heliostats for a visit by automatic control", 1, 127)
     known: float = _number(
         4.0,
         "largest expected beam error of a participating heliostat, RMS",
@@ -196,7 +196,7 @@ class ReceiverSettings(CodedSettings):
         above=True,
     )
     again: float = _number(
-        1.5, "most photographs, as a multiple of the number that a visit needs", 1, 10
+        1.5, "maximum number of photographs, as a multiple of the number that a visit needs", 1, 10
     )
     exposures: int = _number(1, "frames that are averaged for a photograph", 1, 100)
     power: float = _number(

@@ -133,7 +133,7 @@ class Plant(Value, Framed):
             if inside.any():
                 k = int(np.flatnonzero(inside)[0])
                 raise InputError(
-                    f"heliostat {self.names[k]} stands {away[k]:.2f} m from the axis of a tower "
+                    f"heliostat {self.names[k]} is {away[k]:.2f} m from the axis of a tower "
                     f"of radius {tower.radius:g} m, inside it; correct one of them"
                 )
 

@@ -498,8 +498,8 @@ class TcpServer:
             )
         except OSError as error:
             raise LinkError(
-                f"cannot listen on {self._host}:{self._requested} ({error.strerror or error}); is "
-                "another plant running there?"
+                f"cannot listen on {self._host}:{self._requested} ({error.strerror or error}); "
+                "check whether another plant is running there"
             ) from None
         self.port = server.sockets[0].getsockname()[1]
         self._listening.set()

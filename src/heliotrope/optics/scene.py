@@ -283,7 +283,7 @@ class Scene:
             if inside.any():
                 k = int(np.flatnonzero(inside)[0])
                 raise InputError(
-                    f"scene: mirror {k} stands inside a tower of radius {tower.radius} m; move it"
+                    f"scene: mirror {k} is inside a tower of radius {tower.radius} m; move it"
                 )
 
     def with_mirrors(self, mirrors: Mirrors) -> "Scene":

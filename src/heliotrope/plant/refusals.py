@@ -294,7 +294,7 @@ NOT_VERIFIED = Refusal(
     "not verified",
     "A heliostat is sent to the receiver while a calibration is verifying its new parameters.",
     "a calibration has yet to verify its new parameters by a photograph",
-    "Wait until the visit has ended; DEFOCUS, STOW and LOCK end it at once.",
+    "Wait until the visit has ended; DEFOCUS, STOW and LOCK end it immediately.",
 )
 AIM_NOT_TAKEN = Refusal(
     "aim not accepted",
@@ -317,15 +317,15 @@ PLACE_UNKNOWN = Refusal(
     "that moved it; or it is sent to its aim but has not reported since its DEFOCUS or STOW; or it "
     "is silent.",
     "no report shows where it is now, so its path cannot be checked",
-    "Try again in two seconds; if it stays silent, check its cluster and its supply. DEFOCUS and "
-    "STOW are accepted at once.",
+    "Try again in two seconds; if it stays silent, check its cluster and its supply. DEFOCUS "
+    "and STOW are accepted immediately.",
 )
 STILL_MOVING = Refusal(
     "still moving",
     "Where there are keep-out volumes: a moving heliostat is ordered to standby, or assigned "
     "another standby point while it is moving there.",
     "it is still moving, so its path to standby cannot be checked",
-    "Wait until it has stopped, then repeat the order. DEFOCUS and STOW are accepted at once.",
+    "Wait until it has stopped, then repeat the order. DEFOCUS and STOW are accepted immediately.",
 )
 SEEN_ASTRAY = Refusal(
     "pointing error seen from the air",

@@ -459,7 +459,7 @@ BEAM_DISPROVED = AlarmKind(
     "heliostat's beam should be, or was far from its expected position.",
     "{subject}: in a joint visit, {problem}",
     "The results of that visit are not used for this heliostat; its next visit takes place alone.",
-    "If the beam does not move, check the drives and couplings; if it is exchanged with another "
+    "If the beam does not move, check the drives and couplings; if it is swapped with another "
     "heliostat's, check the addresses and the bus wiring.",
     over="{subject}: a photograph has shown its own beam at the expected position",
 )

@@ -175,9 +175,9 @@ def _weather() -> tuple[Condition, ...]:
         ),
         Condition(
             "cold", _PLANT, "temperature", "°C", "air temperature",
-            "the air is at {value}: ice may hold drives, and a stalled drive reports steps that the"
-            " mirror has not made", 1.0, 4.0, _REFUSE, _FIELD, _WARNING, 65.0, clear_for=1800.0,
-            stale_after=60.0, release="the air is warm again",
+            "the air is at {value}: ice may block the drives, and a stalled drive reports "
+            "steps that the mirror has not made", 1.0, 4.0, _REFUSE, _FIELD, _WARNING, 65.0,
+            clear_for=1800.0, stale_after=60.0, release="the air is warm again",
             remedy="Wait until it is warmer; check the mirrors for ice before heliostats leave "
                 "stow.", site=(-20.0, 20.0),
         ),
@@ -304,7 +304,7 @@ def _power_and_records() -> tuple[Condition, ...]:
             "ups_charge_low", _PLANT, "ups_charge", "share", "charge of the UPS",
             "charge of the UPS is {value}",
             0.5, 0.8, _STOW, _FIELD, _SERIOUS, 300.0, clear_for=60.0, stale_after=30.0,
-            release="the UPS is charged", remedy="Restore the mains supply at once.",
+            release="the UPS is charged", remedy="Restore the mains supply immediately.",
             site=(0.2, 0.9),
         ),
         Condition(
@@ -365,7 +365,7 @@ def _mirrors() -> tuple[Condition, ...]:
             "share of the heliostats that failed within 600 s",
             "{value} of the heliostats failed within 600 s", 0.02, 0.01, _REFUSE, _FIELD,
             _WARNING, 20.0, delay=5.0, clear_for=60.0, role=_OPERATOR, release="few faults",
-            remedy="Find what they share: a cluster, a supply, a firmware version.",
+            remedy="Find out what they share: a cluster, a supply, a firmware version.",
             site=(0.002, 0.2),
         ),
         Condition(
@@ -373,7 +373,7 @@ def _mirrors() -> tuple[Condition, ...]:
             "share of the heliostats that failed within 600 s",
             "{value} of the heliostats failed within 600 s", 0.10, 0.05, _DEFOCUS, _FIELD,
             _SERIOUS, 30.0, delay=5.0, clear_for=60.0, role=_SUPERVISOR, release="few faults",
-            remedy="Find at once what they share: a cluster, a supply, a firmware version.",
+            remedy="Find out immediately what they share: a cluster, a supply, a firmware version.",
             site=(0.01, 0.3),
         ),
     )  # fmt: skip

@@ -427,7 +427,7 @@ def _hypotheses(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Tr
         )
         turned = part.counts[:, ::-1].copy()
         yield _Trial(
-            f"its axes seem exchanged: the counts of {joints[0]} are those of {joints[1]}",
+            f"its axes seem swapped: the counts of {joints[0]} are those of {joints[1]}",
             row,
             replace(part, counts=turned),
         )
@@ -435,7 +435,7 @@ def _hypotheses(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Tr
             other = turned.copy()
             other[:, d] = _reversed(mechanism, replace(part, counts=turned), row, d)
             yield _Trial(
-                f"its axes seem exchanged, and {joint} reversed",
+                f"its axes seem swapped, and {joint} reversed",
                 row,
                 replace(part, counts=other),
             )

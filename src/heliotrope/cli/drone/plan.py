@@ -33,7 +33,10 @@ def plan(
         str, typer.Option(help="auto, or jacks, malan8, guo6, khalsa8, full.")
     ] = "auto",
     criterion: Annotated[
-        Literal["d", "v"], typer.Option(help="d: most information; v: smallest beam error.")
+        Literal["d", "v"],
+        typer.Option(
+            help=("What points are chosen for: d, most information; v, smallest beam error.")
+        ),
     ] = "d",
     distance: Annotated[
         float, typer.Option(min=1, max=10_000, help="Distance of the drone from a cluster, m.")

@@ -571,11 +571,11 @@ class AimsTable(StrictTable):
     )
     moves_per_minute: Number = Field(
         AimSettings.moves,
-        description="Most tracking heliostats that are given a new aim per minute; 1 to 6000.",
+        description="Maximum number of tracking heliostats given a new aim per minute; 1 to 6000.",
     )
     together: int = Field(
         AimSettings.together,
-        description="Most heliostats that move to a new aim at the same time; 1 to 1000.",
+        description="Maximum number of heliostats moving to a new aim at the same time; 1 to 1000.",
     )
     every_s: Number = Field(
         AimSettings.every, description="Time between two computations; 5 to 600."

@@ -384,9 +384,9 @@ class _Run:
             root = self._document(_Link("", "", f"{self.base}/{plant}-catalog-stac.json"))
             matches = [_CATALOGUE.search(url) for url in root.hrefs("child")]
         except FetchError:
-            return "; look at its catalogue"
+            return "; see its catalogue"
         close = get_close_matches(name, [match[1] for match in matches if match])
-        return f"; did you mean {', '.join(close)}?" if close else "; look at its catalogue"
+        return f"; did you mean {', '.join(close)}?" if close else "; see its catalogue"
 
     def _document(self, link: _Link) -> _Document:
         url = self._address(link.url)

@@ -292,7 +292,7 @@ class _Files:
         if not prior or abs(value) <= _STRANGE * prior:
             return []
         times = f"{value:g} is {abs(value) / prior:.0f} times the usual installation error"
-        return [f"{who}: {column} {times} (σ {prior:g}); is it in another unit?"]
+        return [f"{who}: {column} {times} (σ {prior:g}); check the unit"]
 
     def _rename(self, old: str, new: str) -> None:
         for camera in self.document.get("cameras", ()):

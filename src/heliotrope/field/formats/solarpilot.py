@@ -345,7 +345,7 @@ def _group(rows: Rows, columns: dict[str, str], group: tuple[str, ...]) -> Float
     missing = np.isnan(values)
     for i in np.flatnonzero(missing.any(axis=1) & ~missing.all(axis=1)):
         what = f"all {len(group)} columns of {group[0].split()[0]} are numbers or NULL"
-        rows.refuse(i, names[int(np.argmax(missing[i]))], f"NULL beside numbers; {what}")
+        rows.refuse(i, names[int(np.argmax(missing[i]))], f"NULL mixed with numbers; {what}")
     return values
 
 

@@ -382,7 +382,7 @@ class PlantFile:
             views = await self._views(person, author, tried)
         by = f"{author}, approved by {person.name}" if author else person.name
         tables = ", ".join(f"{d.table} {d.name}".strip() for d in tried.differs) or "no table"
-        at = "used at once" if views else "takes effect when the plant restarts"
+        at = "takes effect immediately" if views else "takes effect when the plant restarts"
         if not tried.differs:
             at = "the plant already uses these values"
         self._plant.note(person, "PLANT FILE", f"{by}: {tables}; {at} ({reason})")

@@ -390,7 +390,7 @@ def _judge(
         p = int(np.argmax(far))
         return CalibrationOutcome.IMPLAUSIBLE, (
             f"{fitted.names[p]} would be {far[p]:.1f} prior standard deviations from its "
-            f"expected value, above the limit of {settings.most:g}; look at the photographs and "
+            f"expected value, above the limit of {settings.most:g}; check the photographs and "
             "the installation"
         )
     if not after <= settings.left:

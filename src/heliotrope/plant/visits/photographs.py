@@ -250,7 +250,7 @@ class Centred:
         away = float(np.linalg.norm(place - expected))
         if away <= self._centring.astray * min(target.width, target.height):
             return None
-        return f"light {away:.1f} m from the expected place: another heliostat's beam"
+        return f"light {away:.1f} m from the expected position: another heliostat's beam"
 
     async def _go(self, visit: Visit, aim: FloatArray, before: FloatArray) -> None:
         if np.linalg.norm(aim - before) > _SAME:

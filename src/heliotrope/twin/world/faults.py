@@ -28,7 +28,7 @@ KINDS = {
     "bus_unplugged": (1, "the cluster's adapter is unplugged"),
     "power_cut": (6, "a board loses its supply at any instant"),
     "brown_out": (2, "a board loses its supply with a warning"),
-    "flash_cut": (8, "a board loses its supply at a byte of its next write of flash"),
+    "flash_cut": (8, "a board loses its supply in the middle of its next flash write"),
     "tick_jump": (3, "a board's counter jumps"),
     "time_jump": (4, "the cluster's time jumps"),
     "time_lost": (2, "the cluster has no reliable time"),

@@ -14,7 +14,7 @@ from heliotrope.twin.boards.outfit import MACHINE, Outfit
 #: Everything that a run may add, with its meaning.
 WORLDS = {
     "calm": "people rarely take mirrors off the receiver",
-    "swarm": "each run draws its own weights of faults and of what persons do",
+    "swarm": "each run draws its own weights of faults and of people's actions",
     "clock": "the clock of a cluster is wrong from the start, by a minute to an hour",
     "site": "the site of a cluster is wrong by up to 2.5 degrees of longitude or latitude",
     "addresses": "two boards of a cluster have exchanged addresses",
@@ -42,10 +42,10 @@ WORLDS = {
         "search for a beam"
     ),
     "parties": "as visits, by the plant's own schedule: many at once on a target and the receiver",
-    "repairs": "boards, files and stores are exchanged for wrong ones, drives stall, persons lock",
+    "repairs": "boards, files and stores are replaced by wrong ones, drives stall, people lock",
     "common": "plant and clusters begin with the same wrong time, which a sun sensor contradicts",
     "limit": "automatic control aims under a flux limit, and often a ramp, while clouds pass",
-    "days": "as parties, from morning to evening stow: several persons act at any stage of a visit",
+    "days": "as parties, from morning to evening stow: several people act at any stage of a visit",
 }
 #: A short working day, and its length, s.
 DAYS, DAY = "days", 840.0
