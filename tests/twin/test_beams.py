@@ -103,7 +103,7 @@ def rests_in_doubt(ends_at: float, named_again_at: float, until: float) -> None:
 def test_a_doubt_must_be_named_anew_by_a_new_program() -> None:
     """Simulated run 2700083: the program ended with the doubt, and 30 s were over at once."""
     rests_in_doubt(80.0, 83.0, 200.0)
-    with pytest.raises(InvariantError, match=r"H01: IDLE, its beam .* beside where it was sent"):
+    with pytest.raises(InvariantError, match=r"H01: IDLE, its beam .* m from where it was sent"):
         rests_in_doubt(80.0, 1e3, 200.0)
 
 

@@ -747,7 +747,7 @@ class Simulation:
                 for pod in self.pods:
                     pod.freeze(on=False)
             if self._tour is not None and self.plan.seconds >= TOUR_LENGTH:
-                saw = f"the tour is not over after {self.plan.seconds:g} s"
+                saw = f"the tour has not ended after {self.plan.seconds:g} s"
                 self.observer.check(11, self._tour.over, self._clock.monotonic(), "plant", saw)
             self.crash_plant(self._clock.monotonic())
             self.run_twice(group, on=False)
