@@ -308,7 +308,7 @@ class ProgressObserver(Judge):
             off = all(ends.get(name) is CalibrationOutcome.REFUSED for name in names)
             saw = f"a person took the command authority {now - self._took_at:.1f} s ago, and "
             saw += (
-                f"a visit of {', '.join(names)}, which that person has not commanded, was aborted"
+                f"a visit of {', '.join(names)}, whose heliostats nobody has commanded, was aborted"
             )
             self.check(16, not (off and untouched >= set(names)), now, place, saw)
 
