@@ -52,7 +52,7 @@ GRANTED, CROSSING = 4.0, 3.0
 #: Reasons in a refusal, and how long an undisturbed period may have lasted by then, s: statuses
 #: arrive every second, and stored items are requested again after 30 s.
 UNHEARD_REASON, UNHEARD_FOR = "it has sent nothing since", 0.0
-UNCOMPARED_REASON, UNCOMPARED_FOR = "not been compared with the wanted", 45.0
+UNCOMPARED_REASON, UNCOMPARED_FOR = "not been compared with the intended", 45.0
 #: Reason of a refusal because of doubtful step counts, which is wrong if the counts are right.
 DOUBT_REASON = "step counts may be wrong"
 
@@ -272,7 +272,7 @@ class QuietObserver(Judge):
             good = calm <= UNCOMPARED_FOR
         elif DOUBT_REASON in reason:
             sure = now - mirror.sure_since
-            saw = f"refused: {reason}; it has been sure of them for {sure:.0f} s"
+            saw = f"refused: {reason}; its step counts have been certain for {sure:.0f} s"
             good = sure <= STATUS_EVERY
         self._refusals.append((mirror, good, saw))
 
