@@ -212,7 +212,7 @@ def test_after_a_loss_of_more_than_may_be_lost_no_mirror_returns_without_a_perso
     scene.enter(states.DEFOCUSED, 1)
     scene.passes(7.0)
     assert scene.observer.losses == 1
-    with pytest.raises(InvariantError, match=r"H01: TRACKING .* after a loss of the field"):
+    with pytest.raises(InvariantError, match=r"H01: TRACKING .* after the loss of the field"):
         scene.enter(states.TRACKING, 0)
     scene.enter(states.DEFOCUSED, 0)
     scene.observer.released(scene.now)
@@ -251,7 +251,7 @@ def test_where_only_persons_command_a_lost_mirror_stays_away_until_one_does() ->
     scene = Scene(losses=None)
     scene.enter(states.DEFOCUSED, 0)
     scene.passes(5.0)
-    with pytest.raises(InvariantError, match=r"H01: TRACKING .* after a loss of this mirror"):
+    with pytest.raises(InvariantError, match=r"H01: TRACKING .* after the loss of this mirror"):
         scene.enter(states.TRACKING, 0)
     scene.enter(states.DEFOCUSED, 0)
     scene.observer.resumed(NAMES[:1], "REFOCUS", scene.now)
