@@ -94,7 +94,7 @@ def test_table_and_airspace_file(
         (["--endurance", "10"], "duration '10': write it as"),
         (["--max-height", "10"], "heights 15 m to 10 m"),
         (["--airspace", "none.json"], "none.json: no such file"),
-        (["--distance", "400", "--elevations", "60,80"], "leave no free position at 400 m"),
+        (["--distance", "400", "--elevations", "60,80"], "allow no position at 400 m"),
     ],
 )
 def test_refusals(field: Path, tmp_path: Path, words: list[str], text: str) -> None:

@@ -81,7 +81,7 @@ def test_the_person_enters_with_the_role_of_the_groups(
     token = {"label": "x", "role": "viewer", "own_password": "anything"}
     refused = behind.post("api/v1/tokens", json=token, headers=csrf)
     assert refused.status_code == 403
-    assert "no password here" in refused.json()["detail"]
+    assert "has none here" in refused.json()["detail"]
 
 
 def test_a_session_ends_when_the_proxy_says_another_thing(behind: httpx.Client) -> None:

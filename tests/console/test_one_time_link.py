@@ -92,7 +92,7 @@ def test_its_person_sets_a_first_password_and_nothing_else_before(
     token = {"label": "x", "role": "viewer", "own_password": "none yet"}
     refused = browser_at.post("api/v1/tokens", json=token)
     assert refused.status_code == 403
-    assert "has no password yet" in refused.json()["detail"]
+    assert "has none yet" in refused.json()["detail"]
     given = {"name": NAME, "password": UNSET}
     assert httpx.post(f"{browser_at.base_url}api/v1/session", json=given).status_code == 401
 

@@ -130,7 +130,7 @@ def test_a_camera_is_used_at_once_by_who_has_command(console: LiveConsole, ask: 
     assert ask("engineer", "POST", "authority").is_success
     done = ask("engineer", "PUT", "plant-file", order).json()
     ask("engineer", "DELETE", "authority")
-    assert f"used at once: cameras {name}" in done["text"]
+    assert f"takes effect immediately: cameras {name}" in done["text"]
     after = console.call(lambda: cameras.eye(TARGET))
     assert after.position[0] == pytest.approx(before.position[0] + 0.25)
     assert read_plant(file).camera(name).position[0] == pytest.approx(after.position[0])

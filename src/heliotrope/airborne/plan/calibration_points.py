@@ -184,9 +184,8 @@ def calibration_points(
     free = _free(airspace, points, towards, mirrors, rows, sampling)
     if not free.any():
         raise InputError(
-            f"{label}: heights, fence or keep-outs leave no free position at "
-            f"{sampling.distance:g} m; lower the distance or the elevations, or raise the upper "
-            "height limit"
+            f"{label}: heights, fence or keep-outs allow no position at {sampling.distance:g} m; "
+            "lower the distance or the elevations, or raise the upper height limit"
         )
     towards, points = towards[free], points[free]
     # Neighbours can face almost the same directions, so some of the mirrors represent all of them.
