@@ -136,7 +136,7 @@ def test_a_camera_is_used_at_once_by_who_has_command(console: LiveConsole, ask: 
     assert read_plant(file).camera(name).position[0] == pytest.approx(after.position[0])
     assert ask("engineer", "GET", "plant-file").json()["differs"] == []
     events = ask("viewer", "GET", "events").json()
-    assert any("plant file stored, used at once" in row["text"] for row in events)
+    assert any("plant file stored, takes effect immediately" in row["text"] for row in events)
 
 
 def test_ctl_prints_checks_and_stores(console: LiveConsole, ctl: Ctl, tmp_path: Path) -> None:
@@ -217,7 +217,9 @@ def test_a_camera_is_changed_on_the_page(
         assert page.locator("dialog .hx-changes .good").count() == 1
         page.screenshot(path=f"{console.folder}/plant-file-{width}.png")
         page.click("dialog >> text='Store'")
-        page.wait_for_selector("dialog .hx-told:has-text('plant file stored, used at once')")
+        page.wait_for_selector(
+            "dialog .hx-told:has-text('plant file stored, takes effect immediately')"
+        )
     assert file.read_text() == camera_moved(text, 0.5)
     # Its version, who, when and why; the old text can be brought back.
     page.click("dialog summary:has-text('Stored versions')")

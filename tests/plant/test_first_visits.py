@@ -310,7 +310,7 @@ def test_automatic_control_begins_with_them() -> None:
         ({"first": 3}, "must be 0, or 4 to 127, not 3"),
         (
             {"first": 128},
-            "first .heliostats without a calibration.* must be between 0 and 127, not 128$",
+            "first .maximum number of heliostats without.* must be between 0 and 127, not 128$",
         ),
         ({"first_movement": 6e-3}, "first_movement_mrad .* must be above 0 and at most 5, not 6$"),
     ],
