@@ -128,7 +128,7 @@ def test_a_limit_below_every_beam_is_refused_unless_beams_that_stay_exceed_it() 
         next_round(given(1e-6 * PEAK, aims))
     fixed[0], free[0], aims[0] = PLATE.center, False, np.nan
     answer = next_round(given(1e-6 * PEAK, aims, fixed=fixed, free=free))
-    assert "1 beams whose aims are kept" in answer.problem
+    assert "1 beams have fixed aims" in answer.problem
     for move in answer.moves:
         aims = moved(aims, move)
     assert not np.isfinite(aims).any()

@@ -292,7 +292,7 @@ def test_growth_of_the_expected_error_brings_a_heliostat_back() -> None:
     drifts.learn(replace(record, growth=grows))
     morrow = MORNING + timedelta(days=5)
     assert ask(still, morrow, holds=world.holds) is None
-    assert still.reason == "1 are ready, and all are known well enough"
+    assert still.reason == "heliostats ready: 1; all are calibrated well enough"
     back = ask(drifts, morrow, holds=world.holds)
     assert back is not None
     assert back.heliostat == only

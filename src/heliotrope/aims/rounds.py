@@ -312,9 +312,9 @@ def _kept(now: Round, fixed: FloatArray, limit: FloatArray) -> str:
     if most <= 1.0 - LEAST:
         return ""
     return (
-        f"aims: {int(_aimed(now.fixed).sum())} beams whose aims are kept, by an operator or for "
-        f"their return from a visit, bring up to {100.0 * most:.0f} % of the limit; move some of "
-        "them, or raise the limit"
+        f"aims: {int(_aimed(now.fixed).sum())} beams have fixed aims, set by an operator or kept "
+        f"for the return from a visit, and alone reach {100.0 * most:.0f} % of the limit; move "
+        "some of them, or raise the limit"
     )
 
 

@@ -274,12 +274,12 @@ class Judge:
                 return best, best.assignment.reason
         wanting = int((late | worthy).sum())
         if self.more:
-            return None, f"none found yet; {wanting} need a visit, and not all were judged"
+            return None, f"no useful visit found yet; heliostats due: {wanting}, not all assessed"
         if wanting:
-            return None, f"{wanting} need a visit, but none of them can gain from one now"
+            return None, f"heliostats due for a visit: {wanting}; none would benefit from one now"
         if not ready.any():
             return None, "no heliostat is ready"
-        return None, f"{int(ready.sum())} are ready, and all are known well enough"
+        return None, f"heliostats ready: {int(ready.sum())}; all are calibrated well enough"
 
     def _best(
         self, moment: Moment, chosen: Mask, targets: Sequence[str], overdue: bool

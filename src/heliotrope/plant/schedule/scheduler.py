@@ -50,7 +50,7 @@ VISITS = RetryLaw(
     "visit to a target",
     5,
     900.0,
-    "a person looks at the mirror; one visit a day until then",
+    "someone must inspect the mirror; until then it gets one visit a day",
     longest=DAY,
     rest=16.0 * 3600.0,
     alarm=alarms.CALIBRATION_GIVEN_UP,
