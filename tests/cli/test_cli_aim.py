@@ -62,7 +62,7 @@ def test_a_uniform_flux_and_a_ramp_are_told(aim: Any) -> None:
         "--limit=120", "--wanted=uniform", "--give-percent=5", "--ramp=20", "--csv=a.csv"
     )
     assert code == 0, err
-    assert "differs from the wanted one by" in out
+    assert "differs from the desired flux by" in out
     assert "start-up: the last of" in out
     with Path("a.csv").open(encoding="utf-8") as lines:
         rows = list(csv.DictReader(lines))
@@ -98,7 +98,7 @@ def test_heliostats_that_reach_no_cell_are_named(aim: Any) -> None:
     with Path("a.csv").open(encoding="utf-8") as lines:
         rows = {row["heliostat"]: row for row in csv.DictReader(lines)}
     names = [name for name, row in rows.items() if row["state"] == "reaches no cell"]
-    assert f"{len(names)} heliostats reach no cell of the receiver, {names[0]} first" in out
+    assert f"{len(names)} heliostats reach no receiver cell; the first is {names[0]}" in out
     (group,) = plant.groups.values()
     east = dict(zip(plant.names, group.mechanism.position[:, 0] - first.center[0], strict=True))
     assert {name for name, x in east.items() if x < -3.0} <= set(names)
