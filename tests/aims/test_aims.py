@@ -70,17 +70,17 @@ def test_candidates_across_a_plate_are_as_dense_as_its_beams_need(side: float, a
 def test_a_plate_s_candidates_leave_no_gaps_so_that_a_low_limit_fills_it() -> None:
     given = in_the_middle(field(300, PLATE))
     found = candidates(FieldFlux(given))
-    place = found.aims - PLATE.center
-    across = np.sort((place @ PLATE.right).ravel())
-    own = np.diff((place[0] @ PLATE.right).reshape(found.images.looks, -1)[:, 0]).max()
-    assert np.diff(across).max() < 0.2 * own
-    heights = np.unique(found.shifts)
-    assert np.array_equal(heights, np.arange(heights[0], heights[-1] + 1))
+    right = np.sort(((found.aims - PLATE.center) @ PLATE.right).ravel())
+    # Next to the middle, which all mirrors share, half a spacing remains.
+    right = right[right > 0.01]
+    assert np.diff(right).max() < 0.1 * right[-1] / (found.images.looks // 2)
+    heights = np.unique(np.abs(found.shifts))
+    assert np.array_equal(heights, np.arange(len(heights)))
     limit = 0.09 * float(FieldFlux(given).maps[0].max())
     got = aim_scene(given, Demand(FluxLimit(limit)))
     assert got.excess <= 0.0
-    # With the same places for all mirrors, it is 0.94 with five across, and 0.95 with seven.
-    assert got.engine.powers[0] > 0.97 * found.middle_power
+    # With the same places for all mirrors, it is 0.936 with five across, and 0.977 with seven.
+    assert got.engine.powers[0] > 0.98 * found.middle_power
 
 
 def test_derivatives_are_those_of_moved_beams(scene: Scene) -> None:
