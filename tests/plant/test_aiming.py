@@ -596,19 +596,23 @@ def test_a_hot_spot_sends_off_the_heliostat_that_heats_it_and_not_the_field() ->
             hot = np.linalg.norm(
                 middle - middle[np.unravel_index(flux.argmax(), flux.shape)], axis=-1
             )
-            heat = {row: float(true_flux(made, row)[hot < 0.5].max()) for row in field}
+            heat = {row: float(true_flux(made, row)[hot < 0.3].max()) for row in field}
             off, told = list[set[int]](), set[str]()
             for _ in range(15):
                 # The camera sees more in the spot than is predicted, and elsewhere the same.
-                seen = np.where(hot < 0.5, 1.4, 1.0) * 1e-3 * sky.dni * true_flux(made)
+                seen = np.where(hot < 0.3, 1.4, 1.0) * 1e-3 * sky.dni * true_flux(made)
                 made.operations.flux_check.see(as_float(seen / mean))
                 await asyncio.sleep(3.0)
                 off.append(field - tracking())
                 told.update(texts(made, "flux_above_limit", active=True))
         assert told
         assert all("the measured flux is up to" in text for text in told)
-        assert sum(each == 0.0 for each in heat.values()) >= 2, "others heat other places"
-        assert next(rows for rows in off if rows) == {max(heat, key=heat.__getitem__)}
+        most = max(heat.values())
+        # Two beams may heat the spot alike; one of them is enough.
+        heating = {row for row, each in heat.items() if each > 0.9 * most}
+        assert len(heating) <= 2
+        assert sum(each < 0.1 * most for each in heat.values()) >= 4, "others heat other places"
+        assert next(rows for rows in off if rows) <= heating
         assert max(map(len, off)) == 1, "the field goes on"
 
     played(scene, sensors=(DNI_READING,))

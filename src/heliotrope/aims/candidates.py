@@ -15,9 +15,16 @@ from heliotrope.optics.shading import IntArray
 from heliotrope.optics.surfaces import Cylinder, Plate
 from heliotrope.parallel import run_blocks
 
-#: Number of heights of a mirror's candidates, and of positions across a cylinder and across a
-#: plate.
-HEIGHTS, AROUND, ACROSS = 9, 3, 5
+#: Number of heights of a mirror's candidates, and of positions across a cylinder.
+HEIGHTS, AROUND = 9, 3
+#: Positions across a plate: their spacing in standard deviations of the median beam, and their
+#: least and greatest number. On a plate about as large as its beams, more of them add no power.
+SPACING, FEWEST, MOST = 1.5, 3, 7
+#: Displacement of a plate's candidates across and up from one mirror to the next, in spacings; the
+#: fractional parts of the multiples of these numbers fill a square evenly. If all mirrors had their
+#: candidates at the same places, the flux would have ridges there, and a tight limit would cost
+#: power. On a cylinder, which mirrors face from many sides, the same gains almost nothing.
+STAGGER = (0.7548776662466927, 0.5698402909980532)
 #: The outermost aim lies this many standard deviations of the beam within the edge.
 WITHIN = 0.5
 #: Offset of the outermost aim on a cylinder, across the beam, as a fraction of the radius.
@@ -171,6 +178,29 @@ def on_receiver(scene: Scene, place: FloatArray) -> FloatArray:
     return as_float(across + place[:, 1:] * axis_of(surface_in(scene)))
 
 
+def _places(far: FloatArray, count: int, stagger: float) -> FloatArray:
+    """Return positions from −far to far (H,), staggered from mirror to mirror, (H, count).
+
+    The middle position is 0 for all mirrors.
+    """
+    even = np.linspace(-1.0, 1.0, count)
+    aside = (stagger * np.arange(len(far)) + 0.5) % 1.0 - 0.5
+    moved = np.clip(even + 2.0 / (count - 1) * aside[:, None], -1.0, 1.0)
+    moved[:, count // 2] = 0.0
+    return as_float(moved * far[:, None])
+
+
+def _across_and_up(
+    surface: Plate | Cylinder, width: FloatArray, far: FloatArray, room: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the displacements of the candidates from `middles`, m, (H, K) and (H, S)."""
+    if isinstance(surface, Cylinder):
+        return _places(far, AROUND, 0.0), _places(room, HEIGHTS, 0.0)
+    side = np.ceil(np.median(far) / (SPACING * np.median(width)))
+    count = int(np.clip(2 * side + 1, FEWEST, MOST))
+    return _places(far, count, STAGGER[0]), _places(room, HEIGHTS, STAGGER[1])
+
+
 def candidates(engine: FieldFlux) -> Candidates:
     """Return the candidates of the mirrors of a scene with one receiver.
 
@@ -189,9 +219,8 @@ def candidates(engine: FieldFlux) -> Candidates:
     surface, mirrors = surface_in(scene), scene.mirrors
     width, far, room = regions(scene)
     rows, step = surface.shape[0], surface.height / surface.shape[0]
-    shifts = np.round(np.linspace(-1.0, 1.0, HEIGHTS) * room[:, None] / step).astype(np.int64)
-    count = ACROSS if isinstance(surface, Plate) else AROUND
-    looks = _across(scene, np.linspace(-1.0, 1.0, count) * far[:, None])
+    across, up = _across_and_up(surface, width, far, room)
+    shifts, looks = np.round(up / step).astype(np.int64), _across(scene, across)
     images = engine.images(looks, np.abs(shifts).max(axis=1))
     aims = looks[:, :, None, :] + (step * shifts)[:, None, :, None] * axis_of(surface)
     aims = as_float(aims.reshape(len(mirrors), -1, 3))

@@ -256,7 +256,7 @@ def next_round(now: Round, **light: Any) -> Answer:
         moves,
         safe,
         better,
-        np.nan if best is None else best.choice.gap,
+        np.nan if best is None else best.gap,
         remaining,
         waiting,
         np.flatnonzero(unlit),
