@@ -41,12 +41,15 @@ from heliotrope.cli._light import (
 from heliotrope.errors import InputError, shown
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
     from heliotrope.aims import AimPlan, FluxLimit
     from heliotrope.aims.strategies import Strategy
     from heliotrope.geometry import FloatArray
 
-#: Maximum number of heliostats and cells that are listed.
-NAMED = 5
+#: Maximum number of heliostats and cells that are listed, and of ranges of rows or columns.
+NAMED, RANGES = 5, 3
 
 
 def aim(
@@ -124,6 +127,10 @@ def aim(
     cells: CellOption = None,
     tower: Towers = None,
     csv: Annotated[Path | None, typer.Option("--csv", help="File for the aims.")] = None,
+    cells_csv: Annotated[
+        Path | None,
+        typer.Option("--map", help="File for each cell's flux and limit (CSV)."),
+    ] = None,
     picture: Annotated[
         Path | None, typer.Option(help="Picture to write (.png, .svg or .pdf).")
     ] = None,
@@ -135,7 +142,8 @@ def aim(
     light = light_of(
         dni, shape, air, slope_mrad, error_mrad, reflectivity, clean, focus, facets, cells, tower
     )
-    _check(field, csv, picture)
+    files = {"csv": csv, "map": cells_csv, "picture": picture}
+    _check(field, files)
     allowed = _limit(limit, margin, panels)
     if time is not None and sun is not None:
         raise InputError("use --time or --sun, not both")
@@ -157,15 +165,7 @@ def aim(
         }
     chosen = plans[names[-1]]
     joins = None if ramp is None else chosen.ramp_up(1e3 / 60.0 * ramp)
-    if csv is not None:
-        from heliotrope.aims import write_aims
-
-        write_aims(csv, chosen, joins)
-    if picture is not None:
-        from heliotrope.calibration.plan.report import write_picture
-        from heliotrope.plot import aim_figure
-
-        write_picture(picture, aim_figure(*plans.values()))
+    _write(files, plans, chosen, joins)
     if as_json:
         print_json(_document(plans, chosen) | ({} if joins is None else {"joins_s": joins}))
         return
@@ -175,18 +175,39 @@ def aim(
         print(f"the flux differs from the wanted one by {100 * far:.1f} % of its mean (RMS)")
     if joins is not None:
         _print_ramp(chosen, joins)
-    for name, path in (("csv", csv), ("picture", picture)):
+    for name, path in files.items():
         if path is not None:
             print(f"{name}: {path}")
 
 
-def _check(field: Path, csv: Path | None, picture: Path | None) -> None:
+def _check(field: Path, files: Mapping[str, Path | None]) -> None:
     from heliotrope.calibration.plan.report import check_picture
     from heliotrope.cli.plan import check_outputs
 
+    picture = files["picture"]
     if picture is not None:
         check_picture(picture)
-    check_outputs(tuple(path for path in (csv, picture) if path is not None), field, None)
+    check_outputs(tuple(path for path in files.values() if path is not None), field, None)
+
+
+def _write(
+    files: Mapping[str, Path | None],
+    plans: "Mapping[Any, AimPlan]",
+    chosen: "AimPlan",
+    joins: "FloatArray | None",
+) -> None:
+    from heliotrope.aims import write_aim_map, write_aims
+    from heliotrope.calibration.plan.report import write_picture
+
+    csv, cells, picture = files["csv"], files["map"], files["picture"]
+    if csv is not None:
+        write_aims(csv, chosen, joins)
+    if cells is not None:
+        write_aim_map(cells, chosen)
+    if picture is not None:
+        from heliotrope.plot import aim_figure
+
+        write_picture(picture, aim_figure(*plans.values()))
 
 
 def _limit(text: str, margin: float, panels: Path | None) -> "FluxLimit":
@@ -234,7 +255,8 @@ def _document(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> dict[str, An
         "flux_w_m2": chosen.light.flux,
         "quantile_w_m2": chosen.quantile,
         "limit_w_m2": chosen.limit,
-        "binding": chosen.scene.binding,
+        "binding": chosen.binding,
+        "price_m2": chosen.price,
         "heliostats": [
             {
                 "name": name,
@@ -284,11 +306,49 @@ def _print(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> None:
         print(
             f"{int(chosen.unlit.sum()):,} heliostats reach no cell of the receiver, {first} first"
         )
-    binding = int(chosen.scene.binding.sum())
-    print(f"{binding:,} of {chosen.limit.size:,} cells at the limit")
+    _print_binding(chosen)
     best = np.argsort(-chosen.gain)[:NAMED]
     words = [
         f"{chosen.names[k]} {1e-3 * chosen.gain[k]:.3g} kW" for k in best if chosen.gain[k] > 0
     ]
     if words:
         print(f"calibration would gain most at {', '.join(words)}")
+
+
+def _print_binding(chosen: "AimPlan") -> None:
+    """Print where the limit binds, and the cells in which a higher limit would gain most."""
+    import numpy as np
+
+    binding = chosen.binding
+    count = int(binding.sum())
+    line = f"{count:,} of {binding.size:,} cells {'at' if chosen.excess <= 0 else 'at or above'} "
+    if not count:
+        print(f"{line}the limit")
+        return
+    print(
+        f"{line}the limit, in {_ranges('row', binding.any(axis=1))} (0 is the lowest) and "
+        f"{_ranges('column', binding.any(axis=0))}"
+    )
+    gain = np.where(binding, 1e-5 * chosen.limit * chosen.price, 0.0)
+    over = np.where(binding, chosen.quantile / chosen.limit - 1.0, -np.inf)
+    priced = bool(gain.any())
+    for k in np.argsort(-(gain if priced else over), axis=None)[: min(NAMED, count)]:
+        row, column = np.unravel_index(k, binding.shape)
+        # Adding 0 removes the sign from numbers that round to −0.
+        east, north, up = chosen.cells[row, column].round(1) + 0.0
+        text = f"a 1 % higher limit there adds about {gain[row, column]:.2g} kW"
+        if not priced:
+            text = f"{100 * over[row, column]:+.1f} % over the limit"
+        print(f"  row {row}, column {column} ({east:.1f}, {north:.1f}, {up:.1f} m): {text}")
+
+
+def _ranges(noun: str, mask: "npt.NDArray[np.bool_]") -> str:
+    """Return the ranges of a mask as text, or one range around all of them if there are many."""
+    import numpy as np
+
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    pairs = ends.reshape(-1, 2) - [0, 1]
+    if len(pairs) > RANGES:
+        pairs = np.array([[pairs[0, 0], pairs[-1, 1]]])
+    text = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in pairs.tolist())
+    return f"{noun}{'' if text.isdigit() else 's'} {text}"
