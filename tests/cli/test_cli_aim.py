@@ -102,6 +102,19 @@ def test_the_places_where_the_limit_binds_are_printed(aim: Any) -> None:
     assert "  row " not in out
 
 
+def test_a_limit_file_in_kw_gets_a_hint_of_the_unit(aim: Any) -> None:
+    Path("limit.csv").write_text("120,120\n140,140\n", encoding="utf-8")
+    code, out, err = aim("--limit=limit.csv", "--strategy=middle", "--json")
+    assert code == 0
+    assert json.loads(out)["limit_w_m2"][0][0] == pytest.approx(0.99 * 140.0)
+    assert err == (
+        "heliotrope: limit.csv: no cell's limit is above 140 W/m², which is very low; if the "
+        "numbers were meant as kW/m², multiply them by 1,000\n"
+    )
+    Path("limit.csv").write_text("120,120\n10000,140\n", encoding="utf-8")
+    assert aim("--limit=limit.csv", "--strategy=middle")[::2] == (0, "")
+
+
 @pytest.mark.parametrize(
     ("true", "text"),
     [

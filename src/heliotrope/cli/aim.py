@@ -1,5 +1,6 @@
 """``heliotrope aim``: aims that keep the receiver's flux below a limit despite mirror errors."""
 
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -164,6 +165,8 @@ def aim(
             for name in names
         }
     chosen = plans[names[-1]]
+    if allowed.unit_hint:
+        print(f"heliotrope: {limit}: {allowed.unit_hint}", file=sys.stderr)
     joins = None if ramp is None else chosen.ramp_up(1e3 / 60.0 * ramp)
     _write(files, plans, chosen, joins)
     if as_json:
