@@ -421,6 +421,28 @@ def test_arguments(arguments, says, tmp_path, capsys, monkeypatch) -> None:  # t
     assert says in captured.err
 
 
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        (("flux",), "specify --site LATITUDE,LONGITUDE,HEIGHT"),
+        (("aim", "--limit=100"), "specify --site LATITUDE,LONGITUDE,HEIGHT"),
+        (("standby",), "use a file that contains its site, such as a plant file (TOML)"),
+        (("glare",), "use a file that contains its site, such as a plant file (TOML)"),
+    ],
+    ids=lambda given: given[0] if isinstance(given, tuple) else "",
+)
+def test_a_layout_without_a_site_gets_advice_that_the_command_knows(  # type: ignore[no-untyped-def]
+    command, says, tmp_path, capsys, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("bare.csv").write_text("x,y,z\n10,50,0\n-10,50,0\n", encoding="utf-8")
+    assert _run([command[0], "bare.csv", *command[1:]], monkeypatch) == 2
+    line = capsys.readouterr().err
+    _one_line(line)
+    begin = "heliotrope: bare.csv: a table of positions contains no site, so the sun cannot be "
+    assert line == f"{begin}computed; {says}\n"
+
+
 def test_the_table_is_long_enough() -> None:
     count = len(REPLACED) + 2 * len(FILES) + len(SPOILT) + len(TEXTS) + len(ARGUMENTS)
     assert count >= 60

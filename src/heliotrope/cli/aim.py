@@ -10,9 +10,8 @@ import typer
 
 from heliotrope.cli._calibration import progress
 from heliotrope.cli._common import (
-    open_plant,
+    open_field,
     parse_numbers,
-    parse_site,
     parse_sun,
     parse_time,
     print_json,
@@ -148,7 +147,7 @@ def aim(
     allowed = _limit(limit, margin, panels)
     if time is not None and sun is not None:
         raise InputError("use --time or --sun, not both")
-    plant = open_plant(field, None if site is None else parse_site(site))
+    plant = open_field(field, site)
     light = replace(light, canting=canting_of(canting, light.facets, plant))
     when = None if sun is not None else noon(plant) if time is None else parse_time(time)
     options: dict[str, Any] = {
