@@ -299,15 +299,17 @@ def _print(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> None:
     print_table(
         header, rows, title=f"{chosen.light.plant}: aims on {chosen.light.maps[0].receiver}"
     )
-    if chosen.lost_mirrors.any():
-        print(f"{int(chosen.lost_mirrors.sum()):,} heliostats are lost")
-    if chosen.elsewhere.any():
-        print(f"{int(chosen.elsewhere.sum()):,} heliostats belong to other receivers")
-    if chosen.unlit.any():
-        first = chosen.names[int(chosen.unlit.argmax())]
-        print(
-            f"{int(chosen.unlit.sum()):,} heliostats reach no cell of the receiver, {first} first"
-        )
+    for mask, one, many in (
+        (chosen.lost_mirrors, "is lost", "are lost"),
+        (chosen.elsewhere, "belongs to another receiver", "belong to other receivers"),
+        (chosen.unlit, "reaches no cell of the receiver", "reach no cell of the receiver"),
+    ):
+        count = int(mask.sum())
+        first = chosen.names[int(mask.argmax())]
+        if count == 1:
+            print(f"1 heliostat {one}, {first}")
+        elif count:
+            print(f"{count:,} heliostats {many}, {first} first")
     _print_binding(chosen)
     best = np.argsort(-chosen.gain)[:NAMED]
     words = [
@@ -327,9 +329,10 @@ def _print_binding(chosen: "AimPlan") -> None:
     if not count:
         print(f"{line}the limit")
         return
+    rows, columns = (np.unique(indices) for indices in np.nonzero(binding))
     print(
-        f"{line}the limit, in {_ranges('row', binding.any(axis=1))} (0 is the lowest) and "
-        f"{_ranges('column', binding.any(axis=0))}"
+        f"{line}the limit, in {_ranges('row', rows)} (0 is the lowest) and "
+        f"{_ranges('column', columns)}"
     )
     gain = np.where(binding, 1e-5 * chosen.limit * chosen.price, 0.0)
     over = np.where(binding, chosen.quantile / chosen.limit - 1.0, -np.inf)
@@ -344,13 +347,11 @@ def _print_binding(chosen: "AimPlan") -> None:
         print(f"  row {row}, column {column} ({east:.1f}, {north:.1f}, {up:.1f} m): {text}")
 
 
-def _ranges(noun: str, mask: "npt.NDArray[np.bool_]") -> str:
-    """Return the ranges of a mask as text, or one range around all of them if there are many."""
+def _ranges(noun: str, numbers: "npt.NDArray[np.intp]") -> str:
+    """Return the ranges of rising numbers as text, or the whole range if there are many."""
     import numpy as np
 
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    pairs = ends.reshape(-1, 2) - [0, 1]
-    if len(pairs) > RANGES:
-        pairs = np.array([[pairs[0, 0], pairs[-1, 1]]])
-    text = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in pairs.tolist())
+    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
+    parts = parts if len(parts) <= RANGES else [numbers]
+    text = ", ".join(f"{p[0]}" if p[0] == p[-1] else f"{p[0]} to {p[-1]}" for p in parts)
     return f"{noun}{'' if text.isdigit() else 's'} {text}"
