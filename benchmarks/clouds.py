@@ -8,11 +8,11 @@ the station UAT of NREL's MIDC, from `midc_raw_20181018.txt`, which pvlib's whee
 
 Printed for each case: the greatest true flux over the limit, the share of the steady power 60 s
 after the sun is back, and how much is kept of the energy that a field loses which goes to standby
-at every cloud and comes back along its own start-up. In the case "a cluster is lost" the first cluster has no
-power from the second cloud on. It has less than 2 % of the heliostats: if more fail, the safety
-table refuses new motions of the field for ten minutes, and beams that a cloud has sent to standby
-stay there. In "sensor too high" and "too low" the flux sensor reads five times and a fifth of the
-flux from the first cloud on.
+at every cloud and comes back along its own start-up. In the case "a cluster is lost" the first
+cluster has no power from the second cloud on. It has less than 2 % of the heliostats: if more fail,
+the safety table refuses new motions of the field for ten minutes, and beams that a cloud has sent
+to standby stay there. In "sensor too high" and "too low" the flux sensor reads five times and a
+fifth of the flux from the first cloud on.
 
 ``--heliostats`` and ``--minutes`` change the size, ``--case`` chooses; with 300 heliostats a case
 takes a quarter of an hour.

@@ -151,7 +151,7 @@ def test_an_alarm_says_what_is_wrong_what_happens_and_what_to_do() -> None:
         "H7: no reply for 10 s; never heard. The cluster keeps polling it. Assume that its beam "
         "has not moved; check its supply and its cable."
     )
-    assert alarms.NODE_SILENT.ended("H7").text == "H7: it answers again"
+    assert alarms.NODE_SILENT.ended("H7").text == "H7: it replies again"
     for row in CONDITIONS:
         assert row.remedy.endswith("."), row.name
     for kind in alarms.KINDS.values():

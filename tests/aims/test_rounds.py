@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from heliotrope.aims import Demand, FluxLimit
 from heliotrope.aims.rounds import Answer, Move, Round, next_round
+from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.optics.receiver_flux import FieldFlux
 from heliotrope.optics.scene import Scene
@@ -120,10 +122,13 @@ def test_beams_leave_where_no_aims_hold_the_limit() -> None:
     assert true_flux(aims)[over].max() < 0.05 * PEAK, "a person's beams exceed the limit alone"
 
 
-def test_a_limit_below_every_beam_is_a_problem_and_all_beams_leave() -> None:
-    answer = next_round(given(1e-6 * PEAK, PLATE.center + np.zeros((COUNT, 3))))
-    assert "does not allow even the beam" in answer.problem
-    aims = PLATE.center + np.zeros((COUNT, 3))
+def test_a_limit_below_every_beam_is_refused_unless_beams_that_stay_exceed_it() -> None:
+    aims, fixed, free = PLATE.center + np.zeros((COUNT, 3)), NONE.copy(), ALL.copy()
+    with pytest.raises(InputError, match="does not allow even the beam"):
+        next_round(given(1e-6 * PEAK, aims))
+    fixed[0], free[0], aims[0] = PLATE.center, False, np.nan
+    answer = next_round(given(1e-6 * PEAK, aims, fixed=fixed, free=free))
+    assert "1 beams have fixed aims" in answer.problem
     for move in answer.moves:
         aims = moved(aims, move)
     assert not np.isfinite(aims).any()

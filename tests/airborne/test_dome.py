@@ -265,7 +265,7 @@ def test_dome_command_writes_what_is_needed(tmp_path: Path) -> None:
     # Each ring has four at least.
     assert (len(photos) >= 16, problems) == (True, ())
     wrong = run("dome", tmp_path / "plant.toml", "--elevations", "high")
-    assert "use degrees from 0 to 90, such as 35,50,65,80" in str(wrong.exception)
+    assert "use angles from 0 to 90 degrees, such as 35,50,65,80" in str(wrong.exception)
 
 
 def test_rtk_command_by_targets(case: Case, tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def test_a_wrong_name_is_noticed(case: Case, tmp_path: Path) -> None:
     assert [p.by_hand for p in photos] == [False, *[True] * 2]
     assert len(problems) == 1
     assert "DJI_0001.JPG: H" in problems[0]
-    assert "px from the position that the other places imply" in problems[0]
+    assert "px from the position that the other mirrors imply" in problems[0]
 
 
 def places(rows: list[tuple[str, str, str, float, float]]) -> Matches:

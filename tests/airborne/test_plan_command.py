@@ -85,13 +85,16 @@ def test_table_and_airspace_file(
         (["--points", "8"], "has 8 unknowns; use 9 points or more"),
         (["--formats", "kml"], "--formats 'kml': choose from dji,qgc,litchi, or none"),
         (["--aircraft", "M4"], "there is no aircraft 'M4'"),
-        (["--elevations", "20"], "--elevations '20': use two angles from 0 to 90 degrees"),
+        (
+            ["--elevations", "20"],
+            "--elevations '20': use two angles from 0 to 90 degrees, such as 35,80",
+        ),
         (["--home", "1,2"], "--home '1,2': write three numbers"),
         (["--model", "malan"], "there is no model 'malan'"),
         (["--endurance", "10"], "duration '10': write it as"),
         (["--max-height", "10"], "heights 15 m to 10 m"),
         (["--airspace", "none.json"], "none.json: no such file"),
-        (["--distance", "400", "--elevations", "60,80"], "leave no place at 400 m"),
+        (["--distance", "400", "--elevations", "60,80"], "allow no position at 400 m"),
     ],
 )
 def test_refusals(field: Path, tmp_path: Path, words: list[str], text: str) -> None:

@@ -274,7 +274,7 @@ def test_more_points_than_unknowns() -> None:
 
 
 def test_no_room_in_the_air() -> None:
-    with pytest.raises(InputError, match="leave no place at 150 m"):
+    with pytest.raises(InputError, match="allow no position at 150 m"):
         _chosen(PointSelection(points=9), Airspace(max_height=30.0))
     fence = np.array([[-300.0, -300.0], [300.0, -300.0], [300.0, 10.0], [-300.0, 10.0]])
     with pytest.raises(InputError, match=r"C1: \d+ directions are possible for 60 calibration"):

@@ -81,12 +81,12 @@ def test_what_is_no_scenario_or_lacks_the_heliostat_is_refused(tmp_path: Path) -
     plant, learned = learnt()
     out = tmp_path / "new.h5"
     (tmp_path / "text.h5").write_text("no scenario")
-    with pytest.raises(FormatError, match=r"text\.h5.*a scenario that ARTIST has made"):
+    with pytest.raises(FormatError, match=r"text\.h5.*an ARTIST scenario"):
         write_artist(out, tmp_path / "text.h5", plant, learned)
     with h5py.File(tmp_path / "other.h5", "w") as root:
         root["heliostats/X1/position"] = np.zeros(4)
         root["power_plant/position"] = np.array(plant.site.origin)
-    with pytest.raises(InputError, match=f"heliostat {NAME}.*none of that name"):
+    with pytest.raises(InputError, match=f"heliostat {NAME}.*none with that name"):
         write_artist(out, tmp_path / "other.h5", plant, learned)
     assert not out.exists()
 

@@ -175,7 +175,7 @@ def test_the_goal_ends_the_plan(plant: Plant, fleet: Fleet, joint: CommissionPla
 def test_the_floor_and_the_clouds_are_told(plant: Plant, fleet: Fleet) -> None:
     plan = _plan(plant, fleet, replace(TOGETHER, repeat=8e-4, goal=6e-4, clear=0.5), HALF)
     assert plan.percentiles[-1, 0] >= plan.terms.floor
-    assert "1.13 mrad stay however often" in commission_report.sentence(plan)
+    assert "1.13 mrad remain however often" in commission_report.sentence(plan)
     begin, end = plan.days[0]
     assert sum(plan.seconds.values()) == pytest.approx(2.0 * 0.5 * (end - begin), rel=1e-9)
 

@@ -115,7 +115,7 @@ def test_hyperparameters_survive_their_document(found: LearntGroup) -> None:
 def test_the_words_name_drift_steps_and_noise(found: LearntGroup) -> None:
     said = group.described(DEFAULTS)
     assert "zeros wander by 1 and 1 mrad over 300 days" in said
-    assert "a step in 1000 days, noise 0.50 of a photograph's sigma" in said
+    assert "a step in 1000 days, noise 0.50 times a photograph's sigma" in said
     assert group.described(found.hyper) != said
 
 

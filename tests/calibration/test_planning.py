@@ -519,7 +519,7 @@ REFUSED: list[tuple[list[str], str]] = [
     (["--campaign", "--count", "0"], "--count must be a whole number from 1 to"),
     (["--campaign", "--worth", "2"], "--worth must be a number from 0 to 1"),
     (["--picture", "a.bmp"], "use one of .png"),
-    (["--csv", "nowhere/x.csv"], "there is no folder nowhere"),
+    (["--csv", "nowhere/x.csv"], "the folder nowhere does not exist"),
     (["--sightings", "no.csv"], "no such file"),
     (["--sigma-mrad", "nan"], "--sigma-mrad must be a number from 0.001"),
     (["--from", "2026-09-02T20:00Z", "--to", "2026-09-02T22:00Z"], "no measurement is possible"),

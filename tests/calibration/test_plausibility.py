@@ -108,8 +108,8 @@ def _below(seen: Sightings) -> FloatArray:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda s: {"time": -2.3e9}, "the year is out of range, 1970 to 2099"),
-        (lambda s: {"time": 1.0e10}, "the year is out of range, 1970 to 2099"),
+        (lambda s: {"time": -2.3e9}, "the year is outside 1970 to 2099"),
+        (lambda s: {"time": 1.0e10}, "the year is outside 1970 to 2099"),
         (lambda s: {"time": NOON + 5e8}, "more than a year ahead of this computer's clock, 2025-"),
         (lambda s: {"source": _below(s)}, "the sun is below the horizon: its elevation is -"),
         (lambda s: {"time": s.time[4] + 7200.0}, "but the actual sun was at"),
@@ -194,13 +194,11 @@ MISTAKES = {
     "the motor of azimuth seems reversed": _reversed(0),
     "the motor of elevation seems reversed": _reversed(1),
     "both seem reversed": lambda s: replace(s, counts=-s.counts),
-    "its axes seem exchanged: the counts of azimuth": lambda s: replace(
-        s, counts=s.counts[:, ::-1]
-    ),
+    "its axes seem swapped: the counts of azimuth": lambda s: replace(s, counts=s.counts[:, ::-1]),
     "the azimuth of the sun seems to have the wrong sign": lambda s: replace(
         s, source=s.source * [-1.0, 1.0, 1.0]
     ),
-    "the azimuth of the sun seems to count from south": lambda s: replace(
+    "the azimuth of the sun seems to be counted from south": lambda s: replace(
         s, source=s.source * [-1.0, -1.0, 1.0]
     ),
 }
@@ -248,7 +246,7 @@ def test_a_mirror_that_did_not_move_is_not_converged() -> None:
     half = seen_of([2])
     half.counts[:, 0] = half.counts[0, 0]
     (misfit,) = find_misfits(NOMINAL, half)
-    assert misfit.reason == "the counts of azimuth did not change; check motor and log"
+    assert misfit.reason == "the counts of azimuth did not change; check the motor and the log"
 
 
 @pytest.mark.parametrize(
@@ -288,7 +286,7 @@ def test_mirrored_photographs_are_named_once(text: str, sign: list[float]) -> No
     learned = learning.learn(PLANT, wrong, "guo6", rounds=2)
     (line,) = unexplained_mirrors(NAMES, learned)
     names = ", ".join(NAMES[row] for row in (0, 2, 9, 15))
-    assert line.startswith(f"{names}: the photographs of the targets seem {text}: read like that")
+    assert line.startswith(f"{names}: the photographs of the targets seem {text}: read that way")
     assert not at_moment(NAMES, learned).learnt.any()
     assert learning.learn(PLANT, seen, "guo6", rounds=2).misfits == ()
 
@@ -311,7 +309,7 @@ def test_sightings_that_contradict_each_other_are_not_learnt() -> None:
     learned = learning.learn(PLANT, join([good, wrong]), "guo6", rounds=2)
     (line,) = unexplained_mirrors(NAMES, learned)
     assert line.startswith(f"{NAMES[2]}: half of its ")
-    assert "times their sigma, from where the others put them: no parameters" in line
+    assert "times their sigma, from where its other sightings predict them: no parameters" in line
     assert list(np.flatnonzero(at_moment(NAMES, learned).learnt)) == [15]
     # Far beyond a sigma that is stated too small, but small: learnt, and said.
     tight = replace(good, sigma=np.full(len(good), 1e-5))
@@ -410,7 +408,7 @@ def test_a_part_that_many_share_is_given_to_mirrors_without_parameters(tmp_path:
     new = found.calibrated.groups["azel"].parameters["elevation_bias"]
     assert new[5] == 0.0
     assert new[6] == pytest.approx(12e-3, abs=4e-3)
-    shared = [line for line in found.remarks if "8 measured ones share: " in line]
+    shared = [line for line in found.remarks if "shared by the 8 measured heliostats: " in line]
     assert shared[0].startswith("9 heliostats without sightings of their own: ")
     assert "elevation_bias +" in shared[0]
 
@@ -491,6 +489,6 @@ def test_a_folder_with_a_bad_year_and_a_copy_is_read(tmp_path: Path) -> None:
     assert len(field.sightings) == 10
     assert [line.split(": ", 1)[1].split(":")[0] for line in field.left_out] == [
         "the year is out of range",
-        "the year is out of range, 1970 to 2099",
+        "the year is outside 1970 to 2099",
         "a copy of another sighting",
     ]

@@ -148,5 +148,5 @@ def test_photographs_of_another_mirror_are_named(field: tuple[Mechanism, Sightin
     ]
     found = learn(nominal, dataclasses.replace(seen, destination=spots), MODEL)
     (line,) = unexplained_mirrors(("A", "B", "C"), found)
-    assert line.startswith("B: 3 of 16 beams were more than 5 mrad from where the others")
+    assert line.startswith("B: 3 of 16 beams were more than 5 mrad from where its other")
     assert "another mirror's beam" in line

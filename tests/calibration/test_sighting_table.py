@@ -528,7 +528,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.M
     seen, kinds = _awkward()
     path = tmp_path / "s.csv"
     path.write_text("before")
-    with pytest.raises(InputError, match="row 2, but there are only 2 names"):
+    with pytest.raises(InputError, match="row 2, but there are only 2 names; pass the names"):
         write_sightings(path, seen, NAMES[:2])
     with pytest.raises(InputError, match="A: the name occurs twice"):
         write_sightings(path, seen, ("A", "B", "A"))
@@ -590,7 +590,7 @@ MALAN_GOOD = "2026-06-21T12:00:00Z;30;45;0.25;-0.5;1000;2000"
             "0,25",
             "column horizontal_offset_m: '0,25' is not a finite number; write a point",
         ),
-        ("-0.5", "-500", "column vertical_offset_m: -500 m is more than 50 m; is it in another"),
+        ("-0.5", "-500", "column vertical_offset_m: -500 m is more than 50 m; check the unit"),
         ("1000", "", "column azimuth_counts: the cell is empty; enter drive counts"),
         ("2000", "nan", "column elevation_counts: 'nan' is not a finite number"),
         (";2000", "", "6 cells under 7 columns"),

@@ -128,7 +128,7 @@ def test_malan_with_a_worm(malan: ModuleType) -> None:
 
 
 def test_the_line_of_sight_is_named(malan: ModuleType) -> None:
-    """One day at one target: position along the line of sight is known by the prior only."""
+    """One day at one target: the position along the line of sight rests on the prior alone."""
     found = malan.study(0.005, mirrors=3)
     drawn = malan.nominal(3)
     names = found.found.names
@@ -140,7 +140,7 @@ def test_the_line_of_sight_is_named(malan: ModuleType) -> None:
     blind = unobservable(names, tight.covariance[0], [weak[n] for n in names], line)
     assert blind[0].remaining > 0.9
     words = " ".join(b.text for b in blind)
-    assert "known by the prior only" in words
+    assert "known only from the prior" in words
     assert "position along the line of sight" in words
     # What the data do decide is not called blind.
     assert not any(name == "tilt_north" for b in blind for name, _ in b.loadings)

@@ -145,7 +145,7 @@ REPLACED: list[tuple[str, str, str, str, str]] = [
     ("NaN", "csv", "A2,azel,10", "A2,azel,nan", "heliostat A2: 'nan' is not a finite number"),
     ("no number", "csv", "A2,azel,10", "A2,azel,ten", "heliostat A2: 'ten' is not a finite number"),
     ("empty cell", "csv", "A2,azel,10", "A2,azel,", "heliostat A2: the cell is empty; enter m"),
-    ("millimetres", "csv", "A2,azel,10,-30", "A2,azel,10000,-30000000", "in another unit?"),
+    ("millimetres", "csv", "A2,azel,10,-30", "A2,azel,10000,-30000000", "check the unit"),
     ("duplicate name", "csv", "A2,azel", "A1,azel", "A1 is already the name of line 2; each name"),
     ("no name", "csv", "A2,azel", ",azel", "the heliostat has no name"),
     ("unknown group", "csv", "A2,azel", "A2,azle", "group 'azle' is not in plant.toml"),

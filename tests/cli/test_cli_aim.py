@@ -132,7 +132,7 @@ def test_a_uniform_flux_and_a_ramp_are_told(aim: Any) -> None:
         "--limit=120", "--wanted=uniform", "--give-percent=5", "--ramp=20", "--csv=a.csv"
     )
     assert code == 0, err
-    assert "differs from the wanted one by" in out
+    assert "differs from the desired flux by" in out
     assert "start-up: the last of" in out
     with Path("a.csv").open(encoding="utf-8") as lines:
         rows = list(csv.DictReader(lines))
@@ -168,7 +168,7 @@ def test_heliostats_that_reach_no_cell_are_named(aim: Any) -> None:
     with Path("a.csv").open(encoding="utf-8") as lines:
         rows = {row["heliostat"]: row for row in csv.DictReader(lines)}
     names = [name for name, row in rows.items() if row["state"] == "reaches no cell"]
-    assert f"{len(names)} heliostats reach no cell of the receiver, {names[0]} first" in out
+    assert f"{len(names)} heliostats reach no receiver cell; the first is {names[0]}" in out
     (group,) = plant.groups.values()
     east = dict(zip(plant.names, group.mechanism.position[:, 0] - first.center[0], strict=True))
     assert {name for name, x in east.items() if x < -3.0} <= set(names)
@@ -190,7 +190,7 @@ def test_lost_heliostats_and_clusters_send_no_light(aim: Any) -> None:
     assert not any(float(row["power_kw"]) or row["up_m"] for row in rows if row["state"] == "lost")
     code, out, err = aim("--limit=120", f"--without={name}")
     assert code == 0, err
-    assert f"1 heliostat is lost, {name}\n" in out
+    assert f"1 heliostat is lost: {name}\n" in out
 
 
 def test_with_two_receivers_each_heliostat_counts_for_its_own(aim: Any) -> None:

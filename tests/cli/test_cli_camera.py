@@ -124,7 +124,7 @@ def test_teach_writes_marks_and_camera(call: Any, shelf: Path, place: Path) -> N
     )
     assert text.count("refined") == 6
     assert re.search(r"^camera at \(-?\d+\.\d\d ± \d+\.\d\d, ", text, re.MULTILINE)
-    assert re.search(r"pixels on their plane accurate to \d+\.\d mm", text)
+    assert re.search(r"pixel positions on the target plane are accurate to \d+\.\d mm", text)
     assert text.rstrip().endswith(f"camera south and 6 marks written to {plant}")
     again = read_plant(plant)
     assert [mark.kind for mark in again.target("target").marks] == ["corner"] * 4 + ["tee", "disc"]
@@ -213,7 +213,10 @@ def test_calibrate_with_a_chessboard(call: Any, shelf: Path, place: Path) -> Non
     text = call(*arguments)
     assert re.search(r"^focal length 5\d\d\.\d ± \d+\.\d, 5\d\d\.\d ± ", text, re.MULTILINE)
     assert re.search(r"board3\.png: 0\.\d\d px", text)
-    assert "note: the camera's pose was found with the old lens and is dropped" in text
+    assert (
+        "note: the camera's pose was found with the old lens parameters and has been removed"
+        in text
+    )
     camera = read_plant(plant).camera("south")
     assert camera.size == (480, 360)
     assert camera.matrix[0, 0] == pytest.approx(MATRIX[0, 0], rel=0.02)
@@ -230,7 +233,7 @@ def test_calibrate_with_marks(call: Any, shelf: Path, place: Path) -> None:
     plant = place / "marked.toml"
     text = call("calibrate", plant, shelf / "south.png", shelf / "grey.png", "--camera", "south")
     assert re.search(r"grey\.png: target target: ", text)
-    assert re.search(r"^6 marks, residuals 0\.\d\d px; pixels on their plane accurate", text, re.M)
+    assert re.search(r"^6 marks, residuals 0\.\d\d px; pixel positions on the target", text, re.M)
     camera = read_plant(plant).camera("south")
     assert camera.targets == ("target",)
     assert camera.position is not None
@@ -335,11 +338,11 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
         ),
         (
             ("calibrate", "bare.toml", *BOARDS, "--camera", "c", "--chessboard", "9x6"),
-            "--chessboard and --square go together",
+            "use --chessboard and --square together",
         ),
         (
             ("calibrate", "bare.toml", *BOARDS, "--camera", "c", "--square", "0.1"),
-            "--chessboard and --square go together",
+            "use --chessboard and --square together",
         ),
         (
             (
@@ -353,7 +356,7 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
                 "--square",
                 "0.1",
             ),
-            "--chessboard '9-6': write the inner corners as 9x6",
+            "--chessboard '9-6': write the number of inner corners as COLUMNSxROWS, such as 9x6",
         ),
         (
             (
@@ -415,11 +418,11 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
         (("calibrate", "bare.toml", "south.png", "--camera", "c"), "has marks; teach them first"),
         (
             ("calibrate", "marked.toml", "south.png", "small.png", "--camera", "c"),
-            "camera c: frames of 320 × 240, 640 × 480 px; use pictures of one size",
+            "camera c: the pictures have different sizes (320 × 240, 640 × 480 px); use pictures",
         ),
         (
             ("calibrate", "seen.toml", "small.png", "--camera", "south"),
-            "camera south: frames of 320 × 240, 640 × 480 px",
+            "camera south: the pictures have different sizes (320 × 240, 640 × 480 px)",
         ),
         (("calibrate", "marked.toml", "grey.png", "--camera", "c"), "no target was found: "),
         (("show", "none.toml"), "none.toml: no such file"),
@@ -477,7 +480,7 @@ def test_receiver_takes_a_reference_that_measures(call: Any, lit: Path, tmp_path
     out = tmp_path / "receiver.toml"
     text = call("receiver", lit / "plant.toml", *pictures_of(lit), "--out", out)
     assert re.search(
-        r"nominal flux uses \d+ % of the scale; daylight on the receiver reads as \d", text
+        r"nominal flux uses \d+ % of the pixel range; daylight on the receiver reads as \d", text
     )
     assert text.endswith(f"reference written to {out}\n")
     shown = receiver_scene.frame(12, seed=5)
@@ -500,7 +503,7 @@ def test_receiver_writes_nothing_where_it_refuses(call: Any, lit: Path, tmp_path
         (("none.toml", *given, "--out", out), "0 receivers; the flux camera needs a plant"),
         (("far.toml", *given, "--out", out), "position is unknown; specify --outline X,Y"),
         (("plant.toml", *given, "--out", tmp_path / "a.json"), "a reference is written as TOML"),
-        (("plant.toml", *given, "--lit", "four.png", "--out", out), "write FILE=SHARE"),
+        (("plant.toml", *given, "--lit", "four.png", "--out", out), "write FILE=FRACTION"),
         (
             ("plant.toml", *given, "--lit", f"{lit / 'four.png'}=0.9", "--out", out),
             "check the fractions",

@@ -94,7 +94,7 @@ def test_a_receiver_beside_the_beams_gets_no_light(flux: Any) -> None:
 
     code, out, err = with_another(first.normal)
     assert code == 0, err
-    assert "beside: 0 MW, peak 0 kW/m², 0.00 % of the light" in out
+    assert "beside: 0 MW, peak 0 kW/m², 0.00 % of the reflected light" in out
     code, _, err = with_another(-first.normal)
     assert code == 2
     assert "receiver beside: no mirror sends light to it; turn the receiver" in err
@@ -164,26 +164,26 @@ def test_a_day_and_a_year_are_tables(flux: Any, tmp_path: Path) -> None:
         ((SUN, "--facets=5"), "--facets '5': write COLUMNSxROWS, such as 5x7"),
         (
             (SUN, "--facets=100x7"),
-            "--facets '100x7': write COLUMNSxROWS, such as 5x7, from 1",
+            "--facets '100x7': write COLUMNSxROWS, such as 5x7, each number from 1",
         ),
         ((SUN, "--facets=5x7", "--canting=noon"), "time 'noon' is not ISO 8601"),
         ((SUN, "--facets=5x7", "--canting=-4"), "--canting '-4': use slant, a focal length from"),
         ((SUN, "--facets=5x7", "--canting=2026-03-20T00:00Z"), "below the horizon at that time"),
-        ((SUN, "--canting=60"), "--canting: applies to the facets of --facets; add --facets"),
+        ((SUN, "--canting=60"), "--canting applies only with --facets; add --facets"),
         (("--sun=0,0,0",), "--sun '0,0,0': write the sun vector as east,north,up"),
         (("--sun=1,2",), "--sun '1,2': write the sun vector as east,north,up"),
         ((SUN, "--csv=a.csv", "--map=a.csv"), "a.csv: two outputs have this name"),
         ((SUN, "--cells=0x4"), "--cells '0x4': write ROWSxCOLUMNS, such as 20x56"),
         ((SUN, "--tower=1,2,3"), "--tower '1,2,3': write four numbers in m"),
-        ((SUN, "--tower=0,-24,30,9"), "of a tower of radius 30 m, inside it; correct either"),
+        ((SUN, "--tower=0,-24,30,9"), "of a tower of radius 30 m, inside it; correct one of them"),
         ((SUN, "--receiver=none"), "receiver 'none'"),
         ((SUN, "--rays=10"), "rays must be between 1,000 and 1,000,000,000, not 10"),
         ((SUN, "--sam=s.csv"), "--sam: this file is written only for --year"),
         ((SUN, "--picture=p.gif"), "use one of"),
-        ((SUN, "--csv=none/h.csv"), "there is no folder none"),
+        ((SUN, "--csv=none/h.csv"), "the folder none does not exist"),
         ((SUN, "--csv=plant.toml"), "this file is an input"),
-        (("--year", "--time=now"), "--time: a year takes no --time"),
-        (("--year", "--rays=1e4"), "--rays: a year cannot be traced"),
+        (("--year", "--time=now"), "--time cannot be used with a year"),
+        (("--year", "--rays=1e4"), "--rays: a year cannot be ray-traced"),
         (("--every=1h", "--netcdf=f.nc"), "--netcdf: this file is written only for one time"),
     ],
 )

@@ -495,7 +495,7 @@ def test_a_burst_is_averaged(folder: Path, call: Any) -> None:
     ("source", "text"),
     [
         (["nowhere"], "source nowhere: no such"),
-        (["a", "b"], "--live follows one source, but 2 were specified"),
+        (["a", "b"], "--live follows a single source, but 2 were specified"),
         (["usb:97"], "no such device"),
         (["http://127.0.0.1:9/x"], "127.0.0.1:9"),
     ],

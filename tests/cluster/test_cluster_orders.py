@@ -117,7 +117,7 @@ def test_without_a_lease_nobody_may_command() -> None:
         await asyncio.sleep(2.0)
         await field.order("c", "LOCK")
         await asyncio.sleep(0.5)
-        assert "nobody has command authority" in field.plant.text("c")
+        assert "nobody has the command authority" in field.plant.text("c")
 
     run(main)
 

@@ -30,9 +30,9 @@ def test_each_person_has_a_share() -> None:
     admission = Admission(lambda: now[0], own=(2.0, 5.0), everybody=(4.0, 8.0))
     assert admitted(admission, ADA) == 5
     assert admitted(admission, GRACE) == 3  # all have had eight
-    with pytest.raises(BusyError, match=r"aim: too many orders of ada.*try again in 1 s"):
+    with pytest.raises(BusyError, match=r"aim: too many orders from ada.*try again in 1 s"):
         admission.admit("aim", ADA)
-    with pytest.raises(BusyError, match="of all users"):
+    with pytest.raises(BusyError, match="from all users"):
         admission.admit("aim", Person("hedy", Role.ENGINEER))
     now[0] = 1.0
     assert admitted(admission, ADA) == 2
@@ -68,7 +68,7 @@ def test_a_flood_of_orders_is_refused_and_safe_ones_are_not(
     assert [one.status_code == 429 for one in seen] == [False, False, True, True]
     assert seen[-1].headers["retry-after"] == "1"
     detail = seen[-1].json()["detail"]
-    assert "too many orders of operator" in detail
+    assert "too many orders from operator" in detail
     assert "\n" not in detail
     # Somebody else goes on, and a safe order of the same person too.
     other = ask("engineer", "POST", "alarms/acknowledge", order)

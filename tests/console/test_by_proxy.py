@@ -81,7 +81,7 @@ def test_the_person_enters_with_the_role_of_the_groups(
     token = {"label": "x", "role": "viewer", "own_password": "anything"}
     refused = behind.post("api/v1/tokens", json=token, headers=csrf)
     assert refused.status_code == 403
-    assert "no password here" in refused.json()["detail"]
+    assert "has none here" in refused.json()["detail"]
 
 
 def test_a_session_ends_when_the_proxy_says_another_thing(behind: httpx.Client) -> None:
@@ -195,7 +195,7 @@ def test_an_account_of_any_name_is_disabled_and_has_no_factor_to_remove(
         own = {"own_password": PASSWORD}
         assert client.patch(path, json={"disabled": True, **own}).json()["name"] == name
         reset = client.post(f"{path}/password", json=own)
-        assert (reset.status_code, "signs in by the proxy" in reset.text) == (409, True)
+        assert (reset.status_code, "signs in through the proxy" in reset.text) == (409, True)
         factor = client.request("DELETE", f"{path}/factor", json=own)
         assert "set up your own second factor first" in factor.json()["detail"]
     account = console.keeper.people.account(name)

@@ -140,7 +140,7 @@ def test_refused_orders_raise_an_alarm(console: LiveConsole, ask: Ask) -> None:
     recorded(console, "viewer: order refused: the role is too low: POST /api/v1/stow by token")
     alarms = {row.condition: row for row in console.call(console.live.operations.logbook.alarms)}
     assert alarms["orders_refused"].active
-    assert "viewer from 127.0.0.1 has too low a role" in alarms["orders_refused"].text
+    assert "the role of viewer from 127.0.0.1 is too low" in alarms["orders_refused"].text
 
 
 def test_a_lockout_raises_an_alarm(console: LiveConsole) -> None:

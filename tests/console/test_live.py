@@ -190,7 +190,9 @@ def test_ctl_says_for_whom_automatic_control_waits(
         held = ctl("operator", "resume")
     finally:
         console.call(lambda: here.release_authority(Person("vera", Role.OPERATOR), token))
-    assert held.stdout == f"{resumed}; it goes on as soon as vera releases command\n", held.output
+    assert held.stdout == (
+        f"{resumed}; it continues as soon as vera releases command authority\n"
+    ), held.output
     assert ctl("operator", "resume").stdout == f"{resumed}\n"
 
 
@@ -237,7 +239,7 @@ def test_ctl_at_the_plant_itself(ctl: Callable[..., Any], console: LiveConsole) 
     left = ctl("operator", *where, "automatic", name)
     assert left.exit_code == 1
     assert left.stdout.startswith(f"AUTOMATIC: 1 refused ({name}: out of service: washing (")
-    assert ctl("operator", *where, "give-back", name).stdout == "lock removed; none is left\n"
+    assert ctl("operator", *where, "give-back", name).stdout == "lock removed; no lock is left\n"
     follows = ctl("operator", *where, "automatic", name)
     assert follows.exit_code == 0, follows.output
     assert f"AUTOMATIC: 1 done ({name}: it is under automatic control" in follows.stdout

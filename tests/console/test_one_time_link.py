@@ -92,7 +92,7 @@ def test_its_person_sets_a_first_password_and_nothing_else_before(
     token = {"label": "x", "role": "viewer", "own_password": "none yet"}
     refused = browser_at.post("api/v1/tokens", json=token)
     assert refused.status_code == 403
-    assert "has no password yet" in refused.json()["detail"]
+    assert "has none yet" in refused.json()["detail"]
     given = {"name": NAME, "password": UNSET}
     assert httpx.post(f"{browser_at.base_url}api/v1/session", json=given).status_code == 401
 
@@ -144,7 +144,7 @@ def test_another_machine_is_refused_and_leaves_it_valid(tmp_path: Path) -> None:
 def test_a_real_plant_makes_none(console: LiveConsole) -> None:
     with (
         patch.object(Operations, "simulated", False),
-        pytest.raises(InputError, match="the plant is real; its people sign in by passwords"),
+        pytest.raises(InputError, match="not available for a real plant"),
     ):
         console.interface.one_time_link(FIRST, console.address)
 
@@ -191,4 +191,4 @@ def test_ctl_says_that_an_account_without_a_password_needs_one(
     refused = CliRunner().invoke(app, words, input=f"{NEW}\n")
     assert refused.exit_code != 0
     said = str(refused.exception or refused.output)
-    assert "has no password until you set one on its /account page" in said
+    assert "has no password until you set one on the console's /account page" in said

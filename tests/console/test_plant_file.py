@@ -113,7 +113,7 @@ def test_engineers_check_and_store_by_the_api(console: LiveConsole, ask: Ask) ->
     assert ask("engineer", "GET", f"plant-file/versions/{old['name']}").json() == text
     assert ask("engineer", "GET", "plant-file/versions/..%2F..").status_code == 404
     again = {"text": text, "version": view["version"], "reason": "not yet delivered"}
-    assert "uses these values already" in ask("engineer", "PUT", "plant-file", again).json()["text"]
+    assert "already uses these values" in ask("engineer", "PUT", "plant-file", again).json()["text"]
     assert '"PLANT FILE"' in (console.folder / "audit.jsonl").read_text()
 
 
@@ -130,13 +130,13 @@ def test_a_camera_is_used_at_once_by_who_has_command(console: LiveConsole, ask: 
     assert ask("engineer", "POST", "authority").is_success
     done = ask("engineer", "PUT", "plant-file", order).json()
     ask("engineer", "DELETE", "authority")
-    assert f"used at once: cameras {name}" in done["text"]
+    assert f"takes effect immediately: cameras {name}" in done["text"]
     after = console.call(lambda: cameras.eye(TARGET))
     assert after.position[0] == pytest.approx(before.position[0] + 0.25)
     assert read_plant(file).camera(name).position[0] == pytest.approx(after.position[0])
     assert ask("engineer", "GET", "plant-file").json()["differs"] == []
     events = ask("viewer", "GET", "events").json()
-    assert any("plant file stored, used at once" in row["text"] for row in events)
+    assert any("plant file stored, takes effect immediately" in row["text"] for row in events)
 
 
 def test_ctl_prints_checks_and_stores(console: LiveConsole, ctl: Ctl, tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_ctl_prints_checks_and_stores(console: LiveConsole, ctl: Ctl, tmp_path: 
     assert "new panel" in ctl("engineer", "plant-file", "--versions")
     name = versions(file)[-1].name
     assert ctl("engineer", "plant-file", "--version", name) == text
-    assert "no text is waiting" in ctl("engineer", "plant-file", "--waiting")
+    assert "no file is waiting" in ctl("engineer", "plant-file", "--waiting")
     assert "only one option" in ctl("engineer", "plant-file", "--versions", "--waiting", code=1)
     mine.write_text(text)
     ctl("engineer", *words)
@@ -217,7 +217,9 @@ def test_a_camera_is_changed_on_the_page(
         assert page.locator("dialog .hx-changes .good").count() == 1
         page.screenshot(path=f"{console.folder}/plant-file-{width}.png")
         page.click("dialog >> text='Store'")
-        page.wait_for_selector("dialog .hx-told:has-text('plant file stored, used at once')")
+        page.wait_for_selector(
+            "dialog .hx-told:has-text('plant file stored, takes effect immediately')"
+        )
     assert file.read_text() == camera_moved(text, 0.5)
     # Its version, who, when and why; the old text can be brought back.
     page.click("dialog summary:has-text('Stored versions')")
@@ -232,7 +234,7 @@ def test_a_camera_is_changed_on_the_page(
     page.fill("dialog [name=reason]", "back")
     page.click("dialog >> text='Store'")
     until(page, "text => document.querySelector('dialog .hx-told').textContent.includes(text)",
-          "used at once")  # fmt: skip
+          "takes effect immediately")  # fmt: skip
     assert file.read_text() == text
     # Nothing of the dialog is cut.
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")

@@ -85,13 +85,13 @@ def test_a_table_is_read_with_its_panels_and_kept_as_a_map(tmp_path: Path) -> No
         (
             "limit_kw_m2 = 600.0",
             'limit_kw_m2 = 1.0\nlimit_map = "a.csv"',
-            "exclude each other; keep one",
+            "cannot be used together; keep one",
         ),
-        ("limit_kw_m2 = 600.0", 'limit_table = "a.csv"', "limit_panels belong together"),
+        ("limit_kw_m2 = 600.0", 'limit_table = "a.csv"', "limit_panels must be used together"),
         (
             "limit_kw_m2 = 600.0",
             'limit_map = "b"\nlimit_table = "a.csv"',
-            "exclude each other; keep one",
+            "cannot be used together; keep one",
         ),
         ('strategy = "limit"', 'strategy = "spread"', 'needs strategy = "limit"'),
         ('strategy = "limit"', 'strategy = "best"', "aims.strategy"),
@@ -126,5 +126,7 @@ def test_a_limit_needs_one_receiver() -> None:
     plant = lay_out("radial", 6)
     (first,) = plant.receivers
     both = (first, replace(first, name="second", center=first.center + [0.0, 0.0, 20.0]))
-    with pytest.raises(InputError, match=r"the plant has 2; .* heliotrope aim for one receiver"):
+    with pytest.raises(
+        InputError, match=r"the plant has 2; .* one receiver at a time with heliotrope aim"
+    ):
         replace(plant, receivers=both, aims=NUMBER)

@@ -47,16 +47,16 @@ def test_an_unknown_heliostat_is_named_with_its_neighbours(
     database: Database, tmp_path: Path
 ) -> None:
     with pytest.raises(
-        FetchError, match=r"heliostat AA93: .* has no heliostat of this name; did you mean AA39\?"
+        FetchError, match=r"heliostat AA93: .* has no heliostat with this name; did you mean AA39\?"
     ):
         fetch_heliostats("AA93", tmp_path, base_url=database.base, settings=FAST)
     del database.files[f"/{PLANT}/{PLANT}-catalog-stac.json"]
-    with pytest.raises(FetchError, match="has no heliostat of this name; look at its catalogue"):
+    with pytest.raises(FetchError, match="has no heliostat with this name; see its catalogue"):
         fetch_heliostats("AA93", tmp_path, base_url=database.base, settings=FAST)
 
 
 def test_nothing_like_it_gets_no_suggestion(database: Database, tmp_path: Path) -> None:
-    with pytest.raises(FetchError, match=r"heliostat zzz: .*; look at its catalogue"):
+    with pytest.raises(FetchError, match=r"heliostat zzz: .*; see its catalogue"):
         fetch_heliostats("zzz", tmp_path, base_url=database.base, settings=FAST)
 
 
@@ -167,7 +167,7 @@ def test_what_is_no_address_is_refused(database: Database, tmp_path: Path) -> No
 def test_two_files_in_one_place_are_refused(database: Database, tmp_path: Path) -> None:
     hrefs = [f"{database.base}/{BIG}", f"{database.base}/elsewhere/{Path(BIG).name}"]
     database.put(ITEM, {"assets": {str(k): {"href": h} for k, h in enumerate(hrefs)}})
-    assert "would be stored where" in refused(database, tmp_path)
+    assert "would overwrite the file from" in refused(database, tmp_path)
 
 
 def checked(database: Database, **said: Any) -> None:

@@ -65,7 +65,7 @@ def test_files_are_read_and_what_does_not_fit_is_one_line(tmp_path: Path) -> Non
         ({"panels": PANELS.replace("0.25,0.5", "0.3,0.5")}, "0.25 to 0.3 is without a limit"),
         ({"panels": PANELS.replace("b,0.5,1", "b,0.4,1")}, "0.4 to 0.5 is on two panels"),
         ({"panels": PANELS.replace("b,0.5,1", "b,0.5,0.9")}, "0.9 to 1 is without a limit"),
-        ({"panels": PANELS.replace("b,0.5,1", "b,1,0.5")}, "line 4.*edges must ascend"),
+        ({"panels": PANELS.replace("b,0.5,1", "b,1,0.5")}, "line 4.*edges must increase"),
         ({"panels": PANELS.replace("down", "left")}, "flow must be up or down, not 'left'"),
         ({"panels": PANELS.replace("430,570", "400,570")}, "path a enters a panel at 400 °C"),
         ({"panels": PANELS.replace("290,570", "290,600")}, "°C is outside the table's 290 to 570"),

@@ -143,7 +143,7 @@ def test_unknown_names_are_refused(file: Path) -> None:
 
 def test_a_value_in_another_unit_gets_a_warning(file: Path) -> None:
     edited = plant_edit.edit(file, "A1", {"tilt_north_rad": "-1.5"}, dry=True)
-    assert any("is it in another unit?" in text for text in edited.warnings)
+    assert any("check the unit" in text for text in edited.warnings)
     assert edited.version == ""
     assert file.with_name("field.csv").read_text() == TABLE
 

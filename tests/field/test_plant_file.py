@@ -408,7 +408,8 @@ def test_a_defocus_that_takes_too_long_is_refused(tmp_path: Path) -> None:
     assert slow != MACHINE
     plant_file.read_plant(with_machine(tmp_path, slow))
     with pytest.raises(
-        FormatError, match=r"of heliostat A\d needs \d\d s to turn away by \d+\.\d°, and has 20 s"
+        FormatError,
+        match=r"of heliostat A\d needs \d\d s to turn away by \d+\.\d°, but has only 20 s",
     ):
         plant_file.read_plant(
             with_machine(tmp_path, slow.replace("defocus_spread = 0", "defocus_spread = 4"))
@@ -520,7 +521,7 @@ def test_joint_visits_are_read_and_survive(tmp_path: Path) -> None:
         (
             "most = 25",
             "most = 200",
-            "joint_visits: joint visits: most (heliostats on one target at once) must be between",
+            "joint_visits: joint visits: most (maximum number of heliostats on one",
         ),
         ("most = 25", "most = 2.5", "joint_visits.most: "),
         ("known_mrad = 3", "known_mrad = 0", "known_mrad (largest"),
@@ -604,7 +605,7 @@ def test_warnings_of_check(tmp_path: Path) -> None:
     texts = [f.text for f in plant_file.check_plant(tmp_path / "p.toml")]
     assert any("no receiver" in t for t in texts)
     assert any("1 pairs of mirrors can touch: the nearest, A and B" in t for t in texts)
-    assert any("1 of 3 heliostats stand behind its plane" in t for t in texts)
+    assert any("1 of 3 heliostats are behind its plane" in t for t in texts)
 
 
 def receiver_document(folder: Path, more: str = "") -> Path:
@@ -721,7 +722,7 @@ def test_guards(make, text: str) -> None:  # type: ignore[no-untyped-def]
     [
         ({"center": (-19.0, -20.0, 1.0)}, "receiver receiver: its centre is 0."),
         ({"center": (0.0, 0.0, -16.5)}, "its centre, -16.50 m up, is below every heliostat"),
-        ({"normal": (0.0, 1.0, 0.0)}, "18 of 18 heliostats stand behind its plane"),
+        ({"normal": (0.0, 1.0, 0.0)}, "18 of 18 heliostats are behind its plane"),
         ({"center": (0.0, 0.0, 13.0)}, "target and receiver have the same centre"),
     ],
 )

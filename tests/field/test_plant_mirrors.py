@@ -350,8 +350,8 @@ SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
         ("v 0 0 0\n", "the mesh has no faces"),
         ("v 0 0\n", "line 1: 'v 0 0': expected three coordinates in m"),
         (f"{SQUARE}f 1 2\n", "line 5: 'f 1 2': expected three vertex numbers or more"),
-        (f"{SQUARE}f 1 2 9\n", "a face has vertex 8, but there are only 4"),
-        (f"{SQUARE}f 1 1 2\n", "triangle 0 has no area; leave it out"),
+        (f"{SQUARE}f 1 2 9\n", "a face uses vertex 8, but there are only 4"),
+        (f"{SQUARE}f 1 1 2\n", "triangle 0 has no area; remove it"),
     ],
 )
 def test_a_mesh_that_cannot_be_is_one_line(content: str, text: str, tmp_path: Path) -> None:
@@ -405,7 +405,7 @@ def test_a_width_is_needed_of_all_but_a_mesh(tmp_path: Path) -> None:
 def test_a_flux_limit_needs_rows_and_columns(tmp_path: Path) -> None:
     aims = '[aims]\nstrategy = "limit"\nlimit_kw_m2 = 500\n'
     path = written(tmp_path, aims, text=_received(CAVITY))
-    with pytest.raises(FormatError, match="receiver, and receiver is a cavity; leave"):
+    with pytest.raises(FormatError, match="receiver, and receiver is a cavity; remove"):
         plant_file.read_plant(path)
 
 
@@ -434,7 +434,7 @@ def test_a_tower_shades(tmp_path: Path) -> None:
         assert found.shading[0] < 0.9
         assert found.shading[1] > 0.99
     inside = tower.replace("52", "59.5")
-    with pytest.raises(FormatError, match=r"A1 stands 0\.50 m from the axis of a tower of radius"):
+    with pytest.raises(FormatError, match=r"A1 is 0\.50 m from the axis of a tower of radius"):
         read(tmp_path, inside)
 
 

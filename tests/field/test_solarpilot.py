@@ -147,11 +147,11 @@ ROW = "0,1,1,10,20,0,NULL,NULL,NULL,NULL,NULL,1,2,90\n"
         (ROW.replace("10", ""), "column 4 (Loc. X): the cell is empty; enter m"),
         (
             ROW.replace("2,90", "2,NULL"),
-            "column 14 (Aim pt. Z): NULL beside numbers; all 3 columns",
+            "column 14 (Aim pt. Z): NULL mixed with numbers; all 3 columns",
         ),
         (
             ROW.replace("0,NULL", "0,50"),
-            "column 8 (Y focus): NULL beside numbers; all 2 columns of focus",
+            "column 8 (Y focus): NULL mixed with numbers; all 2 columns of focus",
         ),
         ("x" + ROW, "column 1 (Template): 'x0' is not a template's number"),
         ("-1" + ROW[1:], "'-1' is not a template's number"),

@@ -252,7 +252,7 @@ def test_marks_beyond_the_frame_are_missed_in_words() -> None:
     lost = only(render(scene(camera=replace(CAMERA, matrix=matrix)), 1).frame)
     assert not lost.found
     # Three on one line tell no plane.
-    assert lost.reason.startswith("its 8 marks were not found together; 3 shapes")
+    assert lost.reason.startswith("its 8 marks were not found in the right arrangement; 3 shapes")
 
 
 def test_what_was_seen_of_a_covered_target_is_said() -> None:
@@ -264,7 +264,7 @@ def test_what_was_seen_of_a_covered_target_is_said() -> None:
     assert lost.view is None
     searched = only(covered(names[:6]))
     assert not searched.found
-    assert "of its 8 marks were seen" in searched.reason or "not found together" in searched.reason
+    assert "of its 8 marks were seen" in searched.reason or "right arrangement" in searched.reason
     nothing = only(Frame(np.full((360, 480), 120, dtype=np.uint8)))
     assert nothing.reason == "none of its 8 marks was seen: outside the frame, or covered"
 

@@ -381,9 +381,10 @@ def test_a_plane_from_the_front_tells_no_focal_length_and_says_so() -> None:
     pixels = project(true, FACE) + rng.normal(0.0, 0.2, (9, 2))
     fit = calibrate_marks(WIDE, [FACE], [pixels], 0.2)
     assert fit.sigma("log_focal") > 0.5
-    said = next(note for note in fit.notes if "focal length and distance are not separable" in note)
+    text = "focal length and distance cannot be determined separately"
+    said = next(note for note in fit.notes if text in note)
     match = re.search(
-        r"px at [\d.]+ m, uncertain by a factor of [\d.]+; .* good to (\d+\.\d) mm$", said
+        r"px at [\d.]+ m, uncertain by a factor of [\d.]+; .* accurate to (\d+\.\d) mm$", said
     )
     assert match
     # 0.2 px of 133 px/m are 1.5 mm; nine marks do better.

@@ -147,12 +147,12 @@ def test_places_count_from_the_centre_of_the_beams_own_target() -> None:
 @pytest.mark.parametrize(
     ("answer", "text"),
     [
-        (None, "a NoneType for target target; return a place"),
-        ((1.0, 2.0, 3.0), "a tuple for target target; return a place"),
+        (None, "a NoneType for target target; return a position"),
+        ((1.0, 2.0, 3.0), "a tuple for target target; return a position"),
         (("here", OWN), "not an array of numbers"),
         (((1.0, np.nan), OWN), "2 finite numbers"),
-        (((1.0, 2.0, 3.0), OWN), r"place \[1.0, 2.0, 3.0\] on target target"),
-        (((140.0, 90.0), OWN), r"place \[140.0, 90.0\] m is not on target target, 8 × 8 m"),
+        (((1.0, 2.0, 3.0), OWN), r"position \[1.0, 2.0, 3.0\] on target target"),
+        (((140.0, 90.0), OWN), r"position \[140.0, 90.0\] m is not on target target, 8 × 8 m"),
         (((1.0, 0.5), 1e-4), "symmetric and positive"),
         (((1.0, 0.5), np.zeros((2, 2))), "symmetric and positive"),
         (((1.0, 0.5), -OWN), "symmetric and positive"),

@@ -49,7 +49,7 @@ def test_a_step_out_of_order_is_refused(
     found.new()
     with pytest.raises(InputError, match=r"already has a key; .* keys bus rotate"):
         found.new()
-    with pytest.raises(InputError, match="no old key beside a new one"):
+    with pytest.raises(InputError, match="no old key that a new one replaces"):
         found.end()
     found.rotate()
     with pytest.raises(InputError, match="already has two keys; run"):

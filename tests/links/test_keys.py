@@ -148,7 +148,7 @@ def test_a_third_key_is_refused_and_so_is_an_end_without_a_new_one(tmp_path: Pat
     path = private(tmp_path / "keys", f'[clusters]\nK1 = "{OLD.hex()}"\n')
     file = KeyFile(path)
     with pytest.raises(
-        InputError, match="K1 has an old key beside a new one; there is nothing to end"
+        InputError, match="K1 has an old key that a new one replaces; there is nothing to end"
     ):
         file.end(["K1"])
     (new,) = file.rotate(["K1"]).values()

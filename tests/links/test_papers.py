@@ -51,7 +51,7 @@ def test_an_alarm_comes_each_day_of_the_last_thirty(tmp_path: Path) -> None:
     clock.days = 41.0
     _, ended = papers.look()
     assert ended.severity.name == "ALARM"
-    assert "ended on" in ended.text
+    assert "expired on" in ended.text
     # Renewed in its place.
     fresh, _ = certificate(tmp_path, 300.0)
     shutil.copy(fresh, pem)
@@ -101,7 +101,7 @@ def test_a_file_without_a_certificate_is_an_alarm(tmp_path: Path) -> None:
     papers = Papers(Days(0.0))
     papers.watch_end(tmp_path / "x.pem")
     (alarm,) = papers.look()
-    assert "the end of certificate" in alarm.text
+    assert "the expiry date of certificate" in alarm.text
     assert "holds no PEM certificate" in alarm.text
     papers.watch_end(tmp_path / "none.pem")
     (alarm,) = papers.look()

@@ -233,7 +233,7 @@ def test_a_folder_with_a_long_name_has_sockets_too(tmp_path: Path) -> None:
 def test_a_stale_socket_is_replaced(tmp_path: Path) -> None:
     listen(tmp_path / "a.sock").close()
     listen(tmp_path / "a.sock").close()
-    with pytest.raises(AwayError, match="is it running"):
+    with pytest.raises(AwayError, match="check that it is running"):
         ask_once(tmp_path / "a.sock", HELLO, "echo", {})
 
 
@@ -346,7 +346,7 @@ def test_a_socket_of_another_user_is_given_no_token(
     listener = listen(tmp_path / "a.sock")
     monkeypatch.setattr("heliotrope.local.sockets.os.getuid", lambda: 12345)
     monkeypatch.setattr("heliotrope.local.sockets.user_of", lambda _: None)
-    with pytest.raises(AwayError, match="another user listens there"):
+    with pytest.raises(AwayError, match="another user is listening on it"):
         ask_once(tmp_path / "a.sock", HELLO, "echo", {})
     connection, _ = listener.accept()
     connection.settimeout(5.0)

@@ -303,7 +303,7 @@ def _reflected(**changes: object) -> Beam:
         (lambda: _reflected(dni=0.0), "dni 0.0 W/m²"),
         (lambda: _reflected(focal=-5.0), "focal -5.0 m"),
         (lambda: _reflected(elements=0), "0 elements"),
-        (lambda: _reflected(facets=(0, 2)), "facets must number .* not 0 × 2"),
+        (lambda: _reflected(facets=(0, 2)), "1 or more facets in each direction, not 0 × 2"),
         (lambda: _reflected(step=1e-4), "use a larger step"),
         (lambda: _reflected(normal=-SUN), "misses target"),
         (lambda: _reflected(R_enu_mirror=np.ones((3, 3))), "must be a rotation"),

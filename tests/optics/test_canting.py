@@ -56,7 +56,7 @@ def test_the_engine_and_rays_agree_on_canted_facets() -> None:
 @pytest.mark.parametrize(
     ("facets", "canting", "line"),
     [
-        ((0, 3), "slant", "1 to 50 facets each way, not 0 × 3"),
+        ((0, 3), "slant", "1 to 50 facets in each direction, not 0 × 3"),
         ((3, 2), -5.0, "focal length must be above 0, not -5.0 m"),
         ((3, 2), -NOON, "pass one sun vector above the horizon"),
     ],

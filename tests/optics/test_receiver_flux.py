@@ -264,7 +264,7 @@ def test_bad_scenes_are_refused_in_one_line() -> None:
         FieldFlux(Scene(SUN, 1000.0, mirrors(), (away,))).check_met()
     with pytest.raises(InputError, match=r"DNI must be 0 or more and finite, not -1\.0 W/m²"):
         Scene(SUN, -1.0, mirrors(), (plate(),))
-    with pytest.raises(InputError, match="mirror 0 stands inside a tower"):
+    with pytest.raises(InputError, match="mirror 0 is inside a tower"):
         Scene(SUN, 1.0, mirrors(), (plate(),), (Tower(0.0, -300.0, 5.0, -1.0, 9.0),))
     with pytest.raises(InputError, match=r"slope must be between 0 and 0\.1, not 0\.2 rad"):
         mirrors(slope=0.2)

@@ -199,7 +199,7 @@ def test_automatic_is_done_where_it_follows_and_says_why_where_it_does_not() -> 
         shown.stow(OPERATOR, (fourth,))
         held = shown.give_back(OPERATOR, (first,))
         assert held.finished
-        assert held.refusals[first].endswith("moves nothing: Egon has the command authority")
+        assert held.refusals[first].endswith("is idle: Egon has the command authority")
         await asyncio.sleep(5.0)
         shown.release_authority(ENGINEER, token)
         ticket = shown.give_back(OPERATOR)
@@ -226,10 +226,10 @@ def test_automatic_at_dusk_and_in_an_emergency_says_that_nothing_follows() -> No
         }
         ticket = shown.give_back(OPERATOR)
         assert ticket.finished
-        assert ticket.refusals[plant.names[0]].endswith("moves nothing: the sun is too low")
+        assert ticket.refusals[plant.names[0]].endswith("is idle: the sun is too low")
         shown.emergency(OPERATOR, "STOW", "smoke")
         ticket = shown.give_back(OPERATOR)
-        assert "moves nothing: an emergency is active" in ticket.text
+        assert "is idle: an emergency is active" in ticket.text
 
     live(work, WORK, start=EVENING)
 

@@ -63,7 +63,7 @@ def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() ->
 
         shown.give_back(OPERATOR, (name,))
         held = shown.why(name)
-        assert "moves nothing: Olga has the command authority" in held.text, held.text
+        assert "is idle: Olga has the command authority" in held.text, held.text
         shown.hold(OPERATOR, (name,), "washing")
         out = shown.why(name)
         assert "it is out of service: washing (Olga" in out.text
@@ -73,7 +73,7 @@ def test_each_reason_in_the_life_of_a_heliostat_has_its_sentence_and_button() ->
         shown.emergency(OPERATOR, reason="smoke")
         await asyncio.sleep(2.0)
         emergency = shown.why(name)
-        assert "an emergency holds (Olga: smoke)" in emergency.text, emergency.text
+        assert "an emergency is active (Olga: smoke)" in emergency.text, emergency.text
         assert emergency.button is Button.WITHDRAW
         assert emergency.remedy == "When the cause is gone, withdraw the order, then press Resume."
         shown.withdraw(OPERATOR)

@@ -41,7 +41,7 @@ def test_boards_with_another_version_are_named_until_they_have_the_expected_one(
             await bench.wait(10.0)
             odd = bench.clusters["pod-2"]
             assert named(bench).keys() == {"pod-2"}
-            text = "cluster pod-2: P2A (11), serial number 99 (9) have other firmware than version"
+            text = "cluster pod-2: P2A (11), serial number 99 (9) do not have firmware version"
             assert named(bench)["pod-2"].startswith(f"{text} 12")
             assert [ask.what for ask in odd.of(Ask)].count("discover") == 1
             odd.found = [here("P2A", 12)]

@@ -67,7 +67,7 @@ def test_new_mirrors_are_calibrated_and_verified_together() -> None:
         results = await here.run()
         assert results[stuck].outcome is CalibrationOutcome.NOT_PROVEN, results[stuck]
         assert results[false].outcome is _NOT_VERIFIED, results[false]
-        assert "the old parameters are back" in results[false].text
+        assert "the old parameters are in use again" in results[false].text
         for name in (stuck, false):
             assert plant.beliefs.record(name) is None
             assert plant.beliefs.known(name) is None
@@ -310,7 +310,7 @@ def test_automatic_control_begins_with_them() -> None:
         ({"first": 3}, "must be 0, or 4 to 127, not 3"),
         (
             {"first": 128},
-            "first .heliostats without a calibration.* must be between 0 and 127, not 128$",
+            "first .maximum number of heliostats without.* must be between 0 and 127, not 128$",
         ),
         ({"first_movement": 6e-3}, "first_movement_mrad .* must be above 0 and at most 5, not 6$"),
     ],

@@ -95,7 +95,7 @@ def test_nothing_moves_beside_what_is_wanted(tmp_path: Path) -> None:
     async def scene(bench: Bench, token: int) -> None:
         plant, cluster = bench.plant, bench.cluster_of(NAME)
         assert NAME in plant.wanted.missing
-        said = r"its stored parameters differ from the wanted ones \(drive_primary"
+        said = r"its stored parameters differ from the intended ones \(drive_primary"
         for command in ("TRACK", "APPROACH", "IDLE", "REFOCUS"):
             with pytest.raises(BeamError, match=f"{command} P1A: {said}"):
                 plant.command(ENGINEER, token, command, (NAME,))
@@ -230,7 +230,7 @@ def test_nothing_moves_before_its_parameters_have_been_compared(tmp_path: Path) 
 
     async def scene(bench: Bench, token: int) -> None:
         plant, cluster = bench.plant, bench.cluster_of(NAME)
-        text = "P1A: its stored parameters have not been compared with the wanted ones"
+        text = "P1A: its stored parameters have not been compared with the intended ones"
         with pytest.raises(RefusedError, match=text):
             plant.command(ENGINEER, token, "APPROACH", (NAME,))
         assert plant.command(ENGINEER, token, "APPROACH", (NAME, OTHER)).blocked.keys() == {NAME}
@@ -276,7 +276,7 @@ def test_a_board_that_has_started_anew_is_compared_before_its_mirror_moves(tmp_p
                 cluster.deaf.add(NAME)
                 cluster.rows[column][row] += 1
                 await bench.wait(2.0)
-                with pytest.raises(RefusedError, match="have not been compared with the wanted"):
+                with pytest.raises(RefusedError, match="have not been compared with the intended"):
                     plant.command(ENGINEER, token, "IDLE", (NAME,))
                 cluster.deaf.clear()
                 plant.authority.keep(ENGINEER, token)

@@ -229,14 +229,14 @@ def test_a_visit_fits_the_rows_of_a_flight_with_its_photographs(tmp_path: Path) 
             {"azimuth_bias": 3e-3},
             (),
             CalibrationOutcome.IMPLAUSIBLE,
-            "deviations of its prior, above 0.01",
+            "prior standard deviations from its expected value, above the limit of 0.01",
         ),
         (
             {},
             {"tilt_east": 0.3},
             (),
             CalibrationOutcome.POOR_FIT,
-            "the fit leaves .* above 3 mrad",
+            "the fit leaves .* above the limit of 3 mrad",
         ),
         (
             {"least": 5},
@@ -257,7 +257,7 @@ def test_a_visit_fits_the_rows_of_a_flight_with_its_photographs(tmp_path: Path) 
             {"elevation_bias": 1e-3},
             (),
             CalibrationOutcome.NO_BETTER,
-            "the fit misses by .* not below 0.5 times",
+            "the fit leaves .* not below 0.5 times",
         ),
     ],
 )
@@ -413,7 +413,7 @@ def test_a_large_change_that_no_photograph_confirms_is_withdrawn(tmp_path: Path,
     for result in results:
         assert result.outcome is CalibrationOutcome.NOT_VERIFIED
         assert result.record is None
-        said = {"another light": "m from its predicted place", "cloud": "be used: cloud"}[why]
+        said = {"another light": "m from its predicted position", "cloud": "be used: cloud"}[why]
         assert said in result.text
 
 

@@ -801,7 +801,7 @@ def test_only_a_row_and_counts_from_after_the_order_prove_it(act: Act, state: in
 
 
 def test_no_motion_begins_in_the_cold(tmp_path: Path) -> None:
-    """Where ice may hold drives; what runs goes on, and DEFOCUS and STOW pass."""
+    """Where ice may block the drives; what runs goes on, and DEFOCUS and STOW pass."""
 
     async def scene(bench: Bench) -> None:
         plant = bench.plant
@@ -816,7 +816,7 @@ def test_no_motion_begins_in_the_cold(tmp_path: Path) -> None:
         await air(12.0, 3)
         assert plant.command(OPERATOR, token, "APPROACH", ("P2A",))
         await air(0.5, 3)
-        said = r"the air is at 0.5 °C: ice may hold drives, .* \(limit 1 °C\)"
+        said = r"the air is at 0.5 °C: ice may block the drives, .* \(limit 1 °C\)"
         with pytest.raises(RefusedError, match=said):
             plant.command(OPERATOR, token, "APPROACH", ("P2B",))
         assert bench.count(states.TRACKING) == 17

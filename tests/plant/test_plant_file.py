@@ -147,7 +147,7 @@ def test_views_and_marks_are_used_at_once(scene: Scene, text: str) -> None:
     assert (scene.audit, scene.told, scene.eyes.taken) == ([], [], [])
     scene.visits = {}
     done = scene.store(text)
-    assert "used at once" in done.text
+    assert "takes effect immediately" in done.text
     assert not scene.view().differs
     new = read_plant(scene.file)
     ((camera, target),) = scene.eyes.taken
@@ -188,7 +188,7 @@ def test_only_a_good_text_of_an_engineer_with_a_reason_is_stored(scene: Scene) -
         scene.store(TARGET, reason=" ")
     with pytest.raises(InputError, match=r"line 19: .*-3: .*nothing was stored"):
         scene.store(TOML.replace("width_m = 3", "width_m = -3"))
-    with pytest.raises(InputError, match="the same as the present file"):
+    with pytest.raises(InputError, match="the same as the current file"):
         scene.store(TOML)
     with pytest.raises(InputError, match="has changed since you opened it"):
         asyncio.run(scene.here.store(ENGINEER, TARGET, "0" * 12, "survey"))
@@ -215,7 +215,7 @@ def test_a_file_that_cannot_be_written_changes_nothing(
     assert scene.file.read_text() == TOML
     assert (scene.eyes.taken, scene.told) == ([], [])
     monkeypatch.undo()
-    assert "used at once" in scene.store(MARK).text
+    assert "takes effect immediately" in scene.store(MARK).text
 
 
 def test_a_caller_who_leaves_does_not_leave_half_of_it(
@@ -244,7 +244,7 @@ def test_a_caller_who_leaves_does_not_leave_half_of_it(
     asyncio.run(go())
     assert scene.file.read_text() == MARK
     assert len(scene.eyes.taken) == 1
-    assert "used at once" in scene.told[-1]
+    assert "takes effect immediately" in scene.told[-1]
 
 
 def test_where_the_file_asks_for_it_a_second_engineer_approves(tmp_path: Path) -> None:

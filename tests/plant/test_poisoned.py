@@ -69,7 +69,7 @@ def test_the_same_false_light_on_a_first_visit_changes_nothing(tmp_path: Path, l
     run_virtual(main, 1)
     (result,) = results
     assert result.outcome is CalibrationOutcome.NOT_VERIFIED, result.text
-    assert "the old parameters are back" in result.text
+    assert "the old parameters are in use again" in result.text
     assert result.record is None
 
 
@@ -100,7 +100,7 @@ def test_new_parameters_go_back_where_no_way_to_their_photograph_is_free(
     (result,) = results
     assert result.outcome is CalibrationOutcome.NOT_VERIFIED, result.text
     assert (
-        "no free path to their photograph: the beam enters walkway; the old parameters are"
+        "path to the verification photograph is not free: the beam enters walkway; the old"
         in result.text
     )
 

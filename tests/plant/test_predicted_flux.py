@@ -67,7 +67,9 @@ def test_after_a_start_the_flux_is_unknown_until_the_heliostats_have_reported() 
         flux._begun = made.plant.now()
         field.heard[:2] = -np.inf
         field.rows["state"][2], field.counted_at[2] = states.TRACKING, -np.inf
-        with pytest.raises(RefusedError, match="not yet known; 3 of 4 heliostats have not yet"):
+        with pytest.raises(
+            RefusedError, match="not yet known; 3 of 4 heliostats have not reported"
+        ):
             await made.operations.receiver_flux()
         await asyncio.sleep(4.0)
         assert (await made.operations.receiver_flux()).power == 0.0

@@ -147,9 +147,9 @@ def test_mirrors_in_production_are_calibrated_where_they_shine() -> None:
         assert here.photographs() == 16, "six mirrors, each with a code of its own"
         others = [stage for stage in here.stages if not stage.startswith("photograph")]
         assert others == [
-            "is the sun steady?",
+            "checking that the sun is steady",
             "back to the aims",
-            "taking the beams apart",
+            "separating the beams",
             "learning from 6 proven beams",
         ]
         assert min(lowest) > 0.99, "the beams stay on the receiver"
@@ -398,7 +398,7 @@ def test_automatic_control_measures_those_that_track_the_receiver(tmp_path: Path
         await here.until(lambda: operations.automatic.view().on)
         operations.calibrate(ENGINEER, names[4], together=names[2:4], receiver=True)
         assert operations.automatic.view().asked == (names[4], *names[2:4])
-        with pytest.raises(RefusedError, match="no beam is searched for"):
+        with pytest.raises(RefusedError, match="neither searches for a beam"):
             operations.calibrate(ENGINEER, names[0], search=True, receiver=True)
         seen: set[str] = set()
 

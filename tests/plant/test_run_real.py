@@ -283,7 +283,7 @@ def test_a_real_plant_over_tcp_mqtt_and_its_own_bus(
             client.change_password(password, "a password of one's own")
             client.sign_in("engineer", "a password of one's own")
             _tracked_and_stowed(client, lines)
-        plant.says(r"4 of \d track")
+        plant.says(r"4 of \d tracking")
         code, text = plant.end(signal.SIGINT)
     assert code == 0, text
     # Ctrl-C stows whom it can, and names the others.
@@ -506,7 +506,7 @@ def test_what_a_links_file_may_not_say(
 
 def test_a_bus_with_other_heliostats_is_refused(folder: Path) -> None:
     homes = {**clusters_of(design()), "K3": ("H5", "H9")}
-    with pytest.raises(FormatError, match="H6 is a heliostat of K3 in this file only"):
+    with pytest.raises(FormatError, match="H6 is listed as a heliostat of K3 only in this file"):
         read(folder, homes)
 
 
@@ -576,10 +576,10 @@ def test_a_plant_of_four_kinds_is_built_by_the_check(folder: Path) -> None:
             ("--start", "1979-12-31"),
             "--start 1979-12-31: the time must be in the years 1981 to 2099",
         ),
-        (("--start", "2012-09-02T10:00"), "has no time zone; append Z for UTC or an offset"),
+        (("--start", "2012-09-02T10:00"), "has no time zone; append Z for UTC, or an offset"),
         (("--check",), "need a real plant; use --clusters"),
         (("--configure",), "need a real plant; use --clusters"),
-        (("--prototype", "--heliostats", 5), "--prototype is a plant of its own; leave out"),
+        (("--prototype", "--heliostats", 5), "--prototype already selects a plant; leave out"),
         (("plant.toml", "--heliostats", 5), "--heliostats applies only to the default plant"),
         (("--speed", 0), "--speed must be a number from 0.001 to 1,000"),
         (("--minutes", 0), "--minutes must be a number from 0.001 to"),
@@ -617,7 +617,7 @@ def test_an_address_that_is_taken_is_one_line(folder: Path) -> None:
         links = ("--clusters", folder / "links.toml", "--data", folder / "data", "--no-console")
         code, _, err = call(folder / "plant.toml", *links, "--minutes", 1)
     assert (code, err.count("\n")) == (2, 1)
-    assert "another plant running there?" in err
+    assert "another plant is running there" in err
 
 
 def test_a_port_of_the_console_that_is_taken_is_one_line() -> None:
@@ -730,7 +730,9 @@ def test_a_group_without_a_machine_is_told_and_not_configured(folder: Path) -> N
     words = (folder / "plant.toml", "--clusters", folder / "links.toml", "--check")
     code, out, _ = call(*words)
     assert code == 0
-    assert out.endswith("--configure needs a machine table, which is missing in group all\n")
+    assert out.endswith(
+        "--configure needs a machine table; add it to the plant file for group all\n"
+    )
     code, _, err = call(*words, "--configure")
     assert (code, err.count("\n")) == (2, 1)
     assert "group all: the plant file has no table [groups.all.machine]; add it" in err

@@ -100,6 +100,26 @@ def test_the_best_is_chosen_of_all_that_can_be() -> None:
     assert value == pytest.approx(max(alone), rel=1e-9)
 
 
+def test_whose_error_costs_power_under_a_flux_limit_comes_first() -> None:
+    one = scheduler()
+    usual = ask(one)
+    assert usual is not None
+    assert "flux limit" not in usual.reason
+    row = PLANT.names.index(usual.heliostat)
+    other = (row + 12) % 24
+    worth = np.ones(24)
+    worth[other] = 50.0
+    one = scheduler()
+    one.weigh(worth)
+    told = ask(one)
+    assert told is not None
+    assert told.heliostat == PLANT.names[other]
+    assert "counts 50.0 times under the flux limit" in told.reason
+    one.cancel(told.heliostat)
+    coming = one.plan(MORNING, timedelta(hours=1), Standing.ready(24))
+    assert PLANT.names[other] in {planned.heliostat for planned in coming[:2]}
+
+
 def test_two_targets_get_two_heliostats() -> None:
     one = scheduler()
     first = ask(one, free_targets=("left",))
@@ -272,7 +292,7 @@ def test_growth_of_the_expected_error_brings_a_heliostat_back() -> None:
     drifts.learn(replace(record, growth=grows))
     morrow = MORNING + timedelta(days=5)
     assert ask(still, morrow, holds=world.holds) is None
-    assert still.reason == "1 are ready, and all are known well enough"
+    assert still.reason == "heliostats ready: 1; all are calibrated well enough"
     back = ask(drifts, morrow, holds=world.holds)
     assert back is not None
     assert back.heliostat == only

@@ -60,9 +60,11 @@ def test_no_beam_at_a_spread_point_passes_a_receiver_or_a_target() -> None:
 
 
 def test_a_limit_that_no_spread_keeps_is_refused_with_one_that_holds() -> None:
-    with pytest.raises(InputError, match=r"no spread keeps 4 suns: .* suns at \(.*\) m") as refused:
+    with pytest.raises(
+        InputError, match=r"no spread stays below 4 suns: .* suns at \(.*\) m"
+    ) as refused:
         field().spread(4.0)
-    found = re.search(r"a limit of (\d+) suns holds", str(refused.value))
+    found = re.search(r"a limit of (\d+) suns can be met", str(refused.value))
     assert found is not None
     holds = float(found[1])
     assert 4.0 < holds < LIMIT

@@ -72,7 +72,9 @@ def test_a_row_from_where_it_is_turned_away_is_left_out() -> None:
         hear(made, field, 1.0, 0.0)
         hear(made, field, 2.0, 0.0)
         hear(made, field, 4.0, 0.0, turned=5000.0, state=DEFOCUSED)
-        with pytest.raises(RefusedError, match="not heard at its aim within 10 s of the photo"):
+        with pytest.raises(
+            RefusedError, match="no report of its position at its aim within 10 s of the photo"
+        ):
             await made.counts_at(2.5)
 
     run_virtual(main)
@@ -222,7 +224,9 @@ def test_a_mirror_that_is_not_heard_at_its_aim_is_not_measured(
         made, field = visit(clock)
         for at, off in heard:
             hear(made, field, at, off)
-        with pytest.raises(RefusedError, match="not heard at its aim within 10 s of the photo"):
+        with pytest.raises(
+            RefusedError, match="no report of its position at its aim within 10 s of the photo"
+        ):
             await made.counts_at(2.5)
 
     run_virtual(main)

@@ -60,7 +60,7 @@ def test_processes_compute_and_begin_again_when_one_has_died(worker: WorkerProce
         with pytest.raises(InputError, match="heliostat") as found:
             await worker(missing, "A2")
         assert str(found.value) == str(UnknownNameError("heliostat", "A2", ("A1",)))
-        with pytest.raises(InputError, match="computes beside the plant has ended; the next"):
+        with pytest.raises(InputError, match="computing process has ended; the next"):
             await worker(killed)
         again = await worker(os.getpid)
         assert again not in (first, os.getpid())

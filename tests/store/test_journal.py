@@ -47,7 +47,9 @@ def test_all_kinds_stand_in_one_list_the_latest_first(filled: Keeper) -> None:
     assert len(found) == 10
     assert found[0] == "command STOW: Olga (operator): all (wash 5%)"
     assert found[1] == "command STOW: Olga (operator): H07, H08 (wash 5%)"
-    assert found[2].startswith("alarm node_silent: H08 silent 1; over at 22 Jun 01:00:30 UTC; ack")
+    assert found[2].startswith(
+        "alarm node_silent: H08 silent 1; cleared at 22 Jun 01:00:30 UTC; ack"
+    )
     assert len(texts(filled, limit=3)) == 3
 
 

@@ -154,7 +154,7 @@ class TestAudit:
             audit.confirm()  # the server's disk is not ours to look at
             return
         monkeypatch.setattr("heliotrope.plant.orders.kept_audit.LEAST_FREE", 1 << 62)
-        with pytest.raises(AuditError, match=r"bytes are left on its disk.*make room"):
+        with pytest.raises(AuditError, match=r"bytes are left on its disk.*free some space"):
             audit.confirm()
 
 

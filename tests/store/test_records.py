@@ -117,7 +117,13 @@ class TestSightings:
         assert np.isnan(keeper.sightings().sightings.time).all()
 
     def test_of_nobody_are_refused(self, keeper: Keeper, seen: Sightings) -> None:
-        with pytest.raises(InputError, match="heliostat row 2, but there are only 2 names"):
+        with pytest.raises(
+            InputError,
+            match=(
+                "heliostat row 2, but there are only 2 names; pass the names of all heliostats; "
+                "pass the names of all heliostats"
+            ),
+        ):
             keeper.record_sightings(NAMES[:2], seen)
 
     def test_are_numbered_on_over_a_restart(

@@ -103,7 +103,7 @@ def rests_in_doubt(ends_at: float, named_again_at: float, until: float) -> None:
 def test_a_doubt_must_be_named_anew_by_a_new_program() -> None:
     """Simulated run 2700083: the program ended with the doubt, and 30 s were over at once."""
     rests_in_doubt(80.0, 83.0, 200.0)
-    with pytest.raises(InvariantError, match=r"H01: IDLE, its beam .* beside where it was sent"):
+    with pytest.raises(InvariantError, match=r"H01: IDLE, its beam .* m from where it was sent"):
         rests_in_doubt(80.0, 1e3, 200.0)
 
 
@@ -212,7 +212,7 @@ def test_after_a_loss_of_more_than_may_be_lost_no_mirror_returns_without_a_perso
     scene.enter(states.DEFOCUSED, 1)
     scene.passes(7.0)
     assert scene.observer.losses == 1
-    with pytest.raises(InvariantError, match=r"H01: TRACKING .* after a loss of the field"):
+    with pytest.raises(InvariantError, match=r"H01: TRACKING .* after the loss of the field"):
         scene.enter(states.TRACKING, 0)
     scene.enter(states.DEFOCUSED, 0)
     scene.observer.released(scene.now)
@@ -251,7 +251,7 @@ def test_where_only_persons_command_a_lost_mirror_stays_away_until_one_does() ->
     scene = Scene(losses=None)
     scene.enter(states.DEFOCUSED, 0)
     scene.passes(5.0)
-    with pytest.raises(InvariantError, match=r"H01: TRACKING .* after a loss of this mirror"):
+    with pytest.raises(InvariantError, match=r"H01: TRACKING .* after the loss of this mirror"):
         scene.enter(states.TRACKING, 0)
     scene.enter(states.DEFOCUSED, 0)
     scene.observer.resumed(NAMES[:1], "REFOCUS", scene.now)

@@ -36,7 +36,7 @@ def line(*spans: tuple[float, bool, bool, bool]) -> None:
 
 def test_a_line_that_nothing_disturbs_is_connected_within_its_time() -> None:
     line((10.0, True, True, True), (90.0, False, False, False), (105.0, True, False, False))
-    with pytest.raises(InvariantError, match=r"C1: nothing stands between .* has not rejoined"):
+    with pytest.raises(InvariantError, match=r"C1: nothing separates .* has not reconnected"):
         line((9.0, False, False, False), (9.0 + REJOINS_WITHIN + 1.0, True, False, False))
     # Since it was connected last, not since a fault was near.
     line((200.0, True, True, True), (210.0, True, False, False), (220.0, True, True, True))
@@ -44,7 +44,7 @@ def test_a_line_that_nothing_disturbs_is_connected_within_its_time() -> None:
 
 def test_leases_keep_their_rate_on_a_line_that_carries() -> None:
     line((10.0, True, True, True), (10.0 + LEASE_EVERY, True, True, False))
-    with pytest.raises(InvariantError, match=r"C1: the plant's last lease left 3\.5 s ago"):
+    with pytest.raises(InvariantError, match=r"C1: the plant sent its last lease 3\.5 s ago"):
         line((10.0, True, True, True), (14.0, True, True, False))
     # They begin anew with the connection.
     line((10.0, True, True, True), (18.0, True, False, False), (20.0, True, True, False))
@@ -107,7 +107,7 @@ def test_a_command_refused_for_another_reason_may_renew_the_authority() -> None:
     with pytest.raises(InvariantError, match="accepted without its record"):
         given(busy, 0.9 + 2.0 * SETTINGS.authority)
     for reason, at in ((busy, 1.0 + 2.0 * SETTINGS.authority), (lost, SETTINGS.authority + 1.0)):
-        with pytest.raises(InvariantError, match="accepted without the authority"):
+        with pytest.raises(InvariantError, match="accepted without the command authority"):
             given(reason, at)
 
 

@@ -313,7 +313,7 @@ def test_an_own_order_of_the_plant_waits_for_its_turn_for_a_time_only() -> None:
     disk.records["x-1"] = Record("x-1", "plant", "plant", "TRACK", "")
     for now in np.arange(0.0, TURN_WITHIN, 1.0):
         observer.look(plant, float(now))
-    with pytest.raises(InvariantError, match="record x-1 has waited for its turn for 61 s"):
+    with pytest.raises(InvariantError, match="record x-1 has been waiting for 61 s"):
         observer.look(plant, TURN_WITHIN + 1.0)
 
 
@@ -399,7 +399,9 @@ def test_the_run_that_is_obeyed_is_the_only_one_while_its_leases_come() -> None:
     # Either may be meant where both gave the same order.
     assert runs.obeyed(["a-2.1", "b-1.1"], 4.0) == ""
     wrong = runs.obeyed(["b-2.1"], 4.0)
-    assert wrong == "run b is obeyed while run a, which was obeyed, has the lease for 1.00 s more"
+    assert wrong == (
+        "run b is obeyed although run a, which was obeyed before, still holds the lease for 1.00 s"
+    )
     assert runs.obeyed(["b-2.1"], 5.0) == ""
     assert runs.obeyed(["a-3.1"], 5.5) == ""  # b's lease came at 0.5 s, and is over
 

@@ -311,7 +311,7 @@ def test_a_plant_outlives_its_field_and_leads_it_again(tmp_path: Path) -> None:
             MAIN, "run", str(folder / "plant.toml"), "--clusters", str(folder / "links.toml"),
             "--no-console", "--data", str(tmp_path / "data"), "--every", "1", "--automatic",
         )  # fmt: skip
-        plant.says("[1-6] of 6 track")
+        plant.says("[1-6] of 6 tracking")
         shown = {name: float((folder / f"{name}.txt").read_text()) for name in WeatherStation.names}
         assert 300.0 < shown["dni"] < 1100.0
         assert shown["wind_mean"] == pytest.approx(3.0, abs=2.0)
@@ -343,7 +343,7 @@ def test_a_plant_leads_boards_on_pseudo_terminals(tmp_path: Path) -> None:
             MAIN, "run", str(folder / "plant.toml"), "--clusters", str(folder / "links.toml"),
             "--no-console", "--data", str(tmp_path / "data"), "--every", "1", "--automatic",
         )  # fmt: skip
-        plant.says("3 move to their aims")
+        plant.says("3 moving to their aims")
     finally:
         field.close()
         if plant is not None:

@@ -308,7 +308,9 @@ def test_the_faults_of_a_failing_run_are_shrunk(monkeypatch: pytest.MonkeyPatch)
     assert [fault.kind for fault in less.plan.drawn] == ["stranger_safe"]
     assert less.violation is not None
     assert less.violation.number == 4
-    with pytest.raises(InputError, match="seed 3: nothing is broken, so there is nothing to shr"):
+    with pytest.raises(
+        InputError, match="seed 3: no invariant was broken, so there are no faults to"
+    ):
         shrink(run(RunPlan(3, 5.0, 1, faults=())))
 
 

@@ -170,7 +170,11 @@ class Answer(Heat):
     unlit
         Free mirrors that send no light to any cell, wherever they aim, (K,).
     problem
-        Why no aims respect the limit; empty if there are such aims.
+        Why no aims respect the limit together with the beams that stay; empty if there are such
+        aims.
+    worth
+        Power that a smaller squared error of each mirror would add under the limit, W/rad², (H,);
+        empty if there are no aims.
     """
 
     moves: tuple[Move, ...]
@@ -181,6 +185,7 @@ class Answer(Heat):
     waiting: int = 0
     unlit: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     problem: str = ""
+    worth: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 #: The last aims computed in this process, with the time of their images and the mirrors in these
@@ -206,8 +211,12 @@ def next_round(now: Round, **light: Any) -> Answer:
     Returns
     -------
     Answer
-        If no aims respect the limit together with the beams that stay, its moves take mirrors off
-        the receiver until those that remain do.
+        If beams that stay leave no room, its moves take other mirrors off the cells concerned.
+
+    Raises
+    ------
+    InputError
+        If no aims respect the limit, although all beams may move.
     """
     rows, columns = surface_in(now.scene).shape
     limit = now.demand.limit.on(rows, columns)
@@ -217,8 +226,9 @@ def next_round(now: Round, **light: Any) -> Answer:
     try:
         best = _best(now, demand, light)
         target_aims = np.where((now.free & ~best.defocused)[:, None], best.aims, np.nan)
-    except InputError as error:
-        problem = _kept(now, fixed, limit) or str(error)
+    except InputError:
+        if not (problem := _kept(now, fixed, limit)):
+            raise
     engine = FieldFlux(_posed(now.scene, now.aims), **light)
     above = _risk(engine, now.demand, room).above
     power = engine.powers[0]
@@ -252,7 +262,14 @@ def next_round(now: Round, **light: Any) -> Answer:
         waiting,
         np.flatnonzero(unlit),
         problem,
+        np.zeros(0) if best is None else _worth(best),
     )
+
+
+def _worth(best: SceneAims) -> FloatArray:
+    """Return the power that a smaller squared error of each mirror would add, W/rad², (H,)."""
+    square = np.trace(best.engine.scene.mirrors.pointing, axis1=1, axis2=2)
+    return as_float(np.where(square > 0.0, best.gain / np.maximum(square, 1e-300), 0.0))
 
 
 def heat(scene: Scene, demand: Demand, aims: FloatArray, **light: Any) -> Heat:
@@ -295,9 +312,9 @@ def _kept(now: Round, fixed: FloatArray, limit: FloatArray) -> str:
     if most <= 1.0 - LEAST:
         return ""
     return (
-        f"aims: {int(_aimed(now.fixed).sum())} beams whose aims are kept, by an operator or for "
-        f"their return from a visit, bring up to {100.0 * most:.0f} % of the limit; move some of "
-        "them, or raise the limit"
+        f"aims: {int(_aimed(now.fixed).sum())} beams have fixed aims, set by an operator or kept "
+        f"for the return from a visit, and alone reach {100.0 * most:.0f} % of the limit; move "
+        "some of them, or raise the limit"
     )
 
 

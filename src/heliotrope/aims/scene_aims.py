@@ -78,7 +78,8 @@ class Demand:
     def __post_init__(self) -> None:
         if not 0.0 <= self.give <= 0.5:
             raise InputError(
-                f"aims: {100 * self.give:g} % of the power for a wanted map; give up 0 to 50 %"
+                f"aims: {100 * self.give:g} % of the power cannot be given up for a desired flux "
+                "map; use 0 to 50 %"
             )
         if not 0.5 <= self.probability <= 0.9999:
             raise InputError(
@@ -417,10 +418,9 @@ def _refuse(scene: Scene, trial: SceneAims, demand: Demand, what: str, advice: s
     hint = f"; {demand.limit.unit_hint}" if demand.limit.unit_hint else ""
     raise InputError(
         f"receiver {surface_in(scene).name}: {what}; {_place(scene, cell)} gets "
-        f"{1e-3 * trial.quantile[cell]:.4g} kW/m², of which errors are "
-        f"{1e-3 * trial.risk.above[cell]:.4g}, {_percent(trial.excess)} above its "
-        f"{1e-3 * trial.limit[cell]:.4g}; raise the limit there to {1e-3 * enough:.4g} kW/m²"
-        f"{advice}{hint}"
+        f"{1e-3 * trial.quantile[cell]:.4g} kW/m², of which {1e-3 * trial.risk.above[cell]:.4g} "
+        f"are due to errors, {_percent(trial.excess)} above its {1e-3 * trial.limit[cell]:.4g}; "
+        f"raise the limit there to {1e-3 * enough:.4g} kW/m²{advice}{hint}"
     )
 
 

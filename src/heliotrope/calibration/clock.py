@@ -68,9 +68,9 @@ class ClockCheck:
         if not self.found:
             least = abs(self.error) + CLEAR * self.sigma
             return (
-                f"clock: no error found, {self.error:+.0f} ± {self.sigma:.0f} s; one below "
-                f"{least:.0f} s ({1e3 * RATE * least:.1f} mrad of the sun) would not show, so "
-                "check the clock by other means"
+                f"clock: no error found, {self.error:+.0f} ± {self.sigma:.0f} s; an error below "
+                f"{least:.0f} s ({1e3 * RATE * least:.1f} mrad of sun movement) would not be "
+                "detected, so check the clock by other means"
             )
         side = "fast" if self.error > 0.0 else "slow"
         return (

@@ -128,7 +128,7 @@ class FlightDocument(_Strict):
             k = int(np.flatnonzero(~good)[0])
             raise ValueError(f"rows.{k}.covariance_m2: it is not a covariance")
         if len({len(row.counts) for row in self.rows}) > 1:
-            raise ValueError("rows: all need counts of the same number of drives")
+            raise ValueError("rows: all rows must have counts for the same number of drives")
         return self
 
 

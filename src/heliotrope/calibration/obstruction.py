@@ -54,9 +54,9 @@ class Unobstructed:
         if not figures["corrected"]:
             return "shading and blocking: no neighbour in the plant file hides any of the mirrors"
         return (
-            f"shading and blocking: {figures['corrected']:,} of {figures['sightings']:,} centroids "
-            f"corrected by {figures['median_shift_mm']:.0f} mm in the median, "
-            f"{figures['largest_shift_mm']:.0f} mm at most"
+            f"shading and blocking: {figures['corrected']:,} of {figures['sightings']:,} "
+            f"centroids corrected by {figures['median_shift_mm']:.0f} mm (median), "
+            f"{figures['largest_shift_mm']:.0f} mm (largest)"
         )
 
     def summary(self) -> dict[str, float]:

@@ -28,7 +28,7 @@ from heliotrope.sun import Site
 #: Period of possible sightings, Unix seconds. No heliostat is older than this period, and later
 #: times are typing errors.
 EARLIEST, LATEST = 0.0, datetime(2100, 1, 1, tzinfo=UTC).timestamp()
-YEAR = "the year is out of range, 1970 to 2099: correct the time"
+YEAR = "the year is outside 1970 to 2099; correct the time"
 #: A time may be this far ahead of the computer's clock, s, because that clock may be slow.
 AHEAD = 366 * 86400.0
 #: Lowest elevation of the sun's centre at which there is a beam, rad; it allows for the solar
@@ -165,7 +165,7 @@ def _impossible(sightings: Sightings, now: float | None) -> Iterator[tuple[Rows,
         clock = format_time(float(np.floor(now)))
         yield (
             ahead,
-            f"the time is more than a year ahead of this computer's clock, {clock}: correct one",
+            f"the time is more than a year ahead of this computer's clock, {clock}; correct it",
         )
     low = sightings.source_at_infinity & (sightings.source[:, 2] < np.sin(LOWEST))
     angles = np.degrees(np.arcsin(np.clip(sightings.source[low, 2], -1.0, 1.0)))
@@ -264,8 +264,8 @@ def _off_target(
     rows = photographed & ~on
     nearest = np.argmin(away[:, rows], axis=0)
     texts = [
-        f"the beam's point is on no target: {away[k, i]:.1f} m from the centre of "
-        f"{surfaces[k].name}, the nearest"
+        f"the beam position is on no target: it is {away[k, i]:.1f} m from the centre of "
+        f"{surfaces[k].name}, the nearest target"
         for k, i in zip(nearest, np.flatnonzero(rows), strict=True)
     ]
     return rows, texts

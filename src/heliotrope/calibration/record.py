@@ -178,8 +178,8 @@ class HeliostatCalibration(Value, Framed):
         for name in ("values", "covariance", "prior"):
             if not np.isfinite(getattr(self, name)).all():
                 raise InputError(
-                    f"calibration of {self.heliostat}: {name} is not finite; do not keep a failed "
-                    "fit"
+                    f"calibration of {self.heliostat}: {name} is not finite; do not store a "
+                    "failed fit"
                 )
 
     def _labelled(self) -> Labelled:

@@ -247,7 +247,7 @@ def read_malan(
             name,
             np.abs(values) > _FARTHEST_OFFSET,
             values,
-            f" m is more than {_FARTHEST_OFFSET:g} m; is it in another unit?",
+            f" m is more than {_FARTHEST_OFFSET:g} m; check the unit",
         )
     good = rows.good
     targeted = camera_target(
@@ -341,8 +341,8 @@ def _sigma(rows: Rows) -> FloatArray:
         name,
         (sigma < SMALLEST_SIGMA) | (sigma > LARGEST_SIGMA),
         values,
-        f" {unit} is outside {scale * SMALLEST_SIGMA:g} to {scale * LARGEST_SIGMA:g} {unit}; is it "
-        "in another unit?",
+        f" {unit} is outside {scale * SMALLEST_SIGMA:g} to {scale * LARGEST_SIGMA:g} {unit}; "
+        "check the unit",
     )
     return sigma
 

@@ -318,11 +318,11 @@ def _in_words(loadings: tuple[tuple[str, float], ...], line: npt.ArrayLike | Non
         direction = as_float(line)
         along = abs(shift @ direction) / (np.linalg.norm(shift) * np.linalg.norm(direction))
         if along > 0.9:
-            return "position along the line of sight is known by the prior only"
+            return "the position along the line of sight is known only from the prior"
     if len(loadings) == 1:
-        return f"{loadings[0][0]} is known by the prior only"
+        return f"{loadings[0][0]} is known only from the prior"
     mixed = " ".join(f"{share:+.2f} {name}" for name, share in loadings)
-    return f"the combination {mixed} (in units of the priors) is known by the prior only"
+    return f"the combination {mixed} (in units of the priors) is known only from the prior"
 
 
 @dataclass(frozen=True)

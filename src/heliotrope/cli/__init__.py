@@ -105,7 +105,7 @@ def main() -> None:
         print(error.message if line is None else f"heliotrope: {line}", file=sys.stderr)
         sys.exit(2)
     except typer.Abort:
-        print("heliotrope: stopped at a prompt without an answer", file=sys.stderr)
+        print("heliotrope: stopped because a prompt was not answered", file=sys.stderr)
         sys.exit(1)
     except HeliotropeError as error:
         print(f"heliotrope: {error}", file=sys.stderr)

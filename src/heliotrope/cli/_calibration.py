@@ -20,20 +20,28 @@ if TYPE_CHECKING:
 # Options with the same meaning in every calibration command.
 Place = Annotated[
     Path,
-    typer.Argument(help="Folder with measurements, properties and tower file; or a plant file."),
+    typer.Argument(
+        help="Folder with measurements, heliostat properties and tower file, or a plant file."
+    ),
 ]
 ModelOption = Annotated[
     str,
-    typer.Option(help="auto; jacks, full, malan8, guo6, khalsa8; or parameter names: a,b,c."),
+    typer.Option(
+        help="Parameters to fit: auto, jacks, full, malan8, guo6, khalsa8, or names such as a,b,c."
+    ),
 ]
 TableOption = Annotated[
-    Path | None, typer.Option(help="Table of sightings (CSV, Parquet) for a plant file.")
+    Path | None, typer.Option(help="Table of sightings (CSV or Parquet); needed with a plant file.")
 ]
 CentroidOption = Annotated[
-    Literal["utis", "helios"], typer.Option(help="Which published centroid to use.")
+    Literal["utis", "helios"], typer.Option(help="Published centroid to use.")
 ]
 PriorOption = Annotated[
-    list[str] | None, typer.Option(help="NAME=SIGMA in rad, m or 1; may be repeated.")
+    list[str] | None,
+    typer.Option(
+        help="Prior standard deviation of a parameter, NAME=SIGMA, in the parameter's unit (rad, m "
+        "or none); may be repeated."
+    ),
 ]
 SplitOption = Annotated[
     Literal[
@@ -54,7 +62,8 @@ SplitOption = Annotated[
 ]
 SeedOption = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of the random split.")]
 SchedulerOption = Annotated[
-    str | None, typer.Option(help="Address of a dask scheduler, or local:N.")
+    str | None,
+    typer.Option(help="Address of a Dask scheduler, or local:N for N processes on this computer."),
 ]
 
 
@@ -64,8 +73,8 @@ def parse_priors(texts: list[str]) -> dict[str, float]:
     for text in texts:
         name, _, value = text.partition("=")
         refusal = (
-            f"--prior {shown(text)}: write NAME=VALUE with a value above 0 in rad, m or 1, for "
-            "example tilt_north=0.005"
+            f"--prior {shown(text)}: write NAME=SIGMA with a value above 0 in the parameter's "
+            "unit (rad, m or none), for example tilt_north=0.005"
         )
         (priors[name.strip()],) = parse_numbers(value, refusal, least=1e-9)
     return priors
@@ -128,7 +137,7 @@ def print_left_out(left_out: Sequence[str], listing: Path | None = None) -> None
     """Print how many measurements were omitted for each reason, and the first one of each."""
     texts = [line.split(": ", 1)[-1] for line in left_out]
     alike = [re.sub(r"[\d.]+", "0", text) for text in texts]
-    named = "" if listing is None else f" (all named in {listing})"
+    named = "" if listing is None else f" (all are listed in {listing})"
     for reason, count in Counter(alike).most_common():
         first = texts[alike.index(reason)]
         print(f"left out: {count} measurements, the first: {first}{named}")

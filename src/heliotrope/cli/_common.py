@@ -29,10 +29,13 @@ def parse_time(text: str) -> datetime:
         time = moment(text)
     except ValueError:
         raise TimeError(
-            f"time {text!r} is not ISO 8601; write it as 2026-06-21T12:00:00Z or with +02:00"
+            f"time {text!r} is not ISO 8601; write it as 2026-06-21T12:00:00Z or "
+            "2026-06-21T14:00:00+02:00"
         ) from None
     if time.tzinfo is None:
-        raise TimeError(f"time {text!r} has no time zone; append Z for UTC or an offset as +02:00")
+        raise TimeError(
+            f"time {text!r} has no time zone; append Z for UTC, or an offset such as +02:00"
+        )
     return time
 
 
@@ -62,8 +65,8 @@ def sunlit(time: datetime, site: "Site", every: str, least: float = 1.0) -> "pd.
     times = daylight(day, site, every=parse_duration(every, least))
     if not len(times):
         raise InputError(
-            f"{site.label}: the sun does not rise on {day} at a multiple of {every}; choose "
-            "another day or a shorter interval"
+            f"{site.label}: the sun is below the horizon at every step of {every} on {day}; "
+            "choose another day or a shorter interval"
         )
     return times
 

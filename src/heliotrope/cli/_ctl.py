@@ -90,8 +90,8 @@ def _sign_in(client: "Client", name: str, password: str) -> None:
     except RemoteError as error:
         if error.status == _REFUSED:
             raise RemoteError(
-                f"{error}; an account opened with the one-time link has no password until you set "
-                "one on its /account page",
+                f"{error}; an account created with the one-time link has no password until you "
+                "set one on the console's /account page",
                 error.status,
             ) from None
         if error.status != _NEEDS_CODE:
@@ -125,7 +125,7 @@ def _client(context: typer.Context) -> "Client | AtPlant":
 @app.command()
 def token(
     context: typer.Context,
-    label: Annotated[str, typer.Argument(help="Purpose of the token.")],
+    label: Annotated[str, typer.Argument(help="Label that says what the token is for.")],
     name: Annotated[str, typer.Option(help="Name of your account.")] = "engineer",
     role: Annotated[str, typer.Option(help="viewer, operator or engineer.")] = "operator",
     days: Annotated[
@@ -133,7 +133,8 @@ def token(
         typer.Option(
             min=0.001,
             max=365,
-            help="Validity in days: at most 365 for a viewer, 90 for a higher role.",
+            help="Days for which the token is valid: at most 365 for a viewer, 90 for a higher "
+            "role.",
         ),
     ] = 30.0,
 ) -> None:
@@ -199,7 +200,7 @@ def _set_up_factor(client: "Client", own: str) -> None:
     print(f"Scan it with an authenticator app, or enter the secret there: {made['secret']}")
     code = typer.prompt("Code shown by the app")
     answer = client.ask("PUT", "session/factor", {"code": code})
-    print("The second factor is enabled. Recovery codes, shown only now, each valid once:")
+    print("The second factor is enabled. Recovery codes, shown only once; each can be used once:")
     print("\n".join(answer["codes"]))
 
 
@@ -231,7 +232,7 @@ def account(
         if reset:
             made = client.ask("POST", f"{_account(name)}/password", again)
             print(
-                f"new password of {name}, shown only now; change it at the first sign-in: "
+                f"new password for {name}, shown only once; change it after signing in: "
                 f"{made['password']}"
             )
         elif disable:
@@ -423,7 +424,7 @@ def events(
     all_names: Annotated[
         bool,
         typer.Option(
-            "--all-names", help="Print the names of all heliostats concerned by each event."
+            "--all-names", help="Print the names of all heliostats that each event affects."
         ),
     ] = False,
     as_json: Json = False,
@@ -513,11 +514,11 @@ def report(
     print(f"records cover {hours:.1f} h of this period, {answer['daylight'] / 3600.0:.1f} h by day")
     for one in answer["production"]:
         print(
-            f"{one['receiver']}: {one['energy'] / 3.6e9:.3f} MWh predicted, at most "
+            f"{one['receiver']}: {one['energy'] / 3.6e9:.3f} MWh predicted, peak "
             f"{one['peak'] / 1e6:.2f} MW at {_utc(one['peak_at'])}"
         )
     if answer["availability"] is not None:
-        print(f"availability {answer['availability']:.1%}; not available:")
+        print(f"availability {answer['availability']:.1%}; heliostat hours lost:")
         print_table(
             ("reason", "heliostat hours"),
             [(why, "-" if s is None else f"{s / 3600:.1f}") for why, s in answer["lacks"].items()],
@@ -534,7 +535,7 @@ def _line(one: dict[str, Any]) -> str:
     """Return an alarm, a lock or an entry of the journal in one line."""
     if "who" in one:
         return f"{one['kind']} {one['name']}: {one['reason']} ({one['who']})"
-    over = f"; over at {_utc(one['cleared'])}" if one.get("cleared") else ""
+    over = f"; cleared at {_utc(one['cleared'])}" if one.get("cleared") else ""
     return f"{one.get('condition', '')} {one['text']}{over}".strip()
 
 
@@ -618,7 +619,7 @@ def command(
     value: Annotated[
         list[float] | None,
         typer.Option(
-            min=-1e9, max=1e9, help="Values of the command, in order.", show_default=False
+            min=-1e9, max=1e9, help="Arguments of the command, in order.", show_default=False
         ),
     ] = None,
     wait: Wait = 60.0,
@@ -694,13 +695,13 @@ def standby(
 def emergency(
     context: typer.Context,
     act: Annotated[str, typer.Option(help="DEFOCUS or STOW.")] = "DEFOCUS",
-    reason: Annotated[str, typer.Option(help="Reason, recorded in the audit trail.")] = "",
+    reason: Annotated[str, typer.Option(help="Reason, recorded in the audit log.")] = "",
     withdraw: Annotated[
         bool, typer.Option("--withdraw", help="Withdraw your order instead.")
     ] = False,
     owner: Annotated[
         str,
-        typer.Option(help="With --withdraw, as an engineer: the user whose order to withdraw."),
+        typer.Option(help="With --withdraw, engineers only: the user whose order is withdrawn."),
     ] = "",
 ) -> None:
     """Move all beams off the receiver now."""
@@ -724,7 +725,9 @@ def _print_causes(answer: dict[str, Any]) -> None:
 @app.command()
 def acknowledge(
     context: typer.Context,
-    condition: Annotated[str, typer.Argument(help="Condition of the alarm.")],
+    condition: Annotated[
+        str, typer.Argument(help="Condition of the alarm, as listed by `ctl list alarms`.")
+    ],
     subject: Annotated[str, typer.Argument(help="Subject of the alarm, if it has one.")] = "",
 ) -> None:
     """Acknowledge an alarm."""
@@ -769,9 +772,11 @@ def calibrate(
 ) -> None:
     """Have automatic control calibrate heliostats next, and wait for the results."""
     if search and (together or receiver):
-        raise InputError("calibrate: --search looks for one beam; leave out --together, --receiver")
+        raise InputError(
+            "calibrate: --search looks for one beam; leave out --together and --receiver"
+        )
     if receiver and (together or target):
-        raise InputError("calibrate: --receiver needs no target; leave out --target, --together")
+        raise InputError("calibrate: --receiver needs no target; leave out --target and --together")
     with _client(context) as client:
         first = heliostats[:1] if together or receiver else heliostats
         tickets = []
@@ -791,7 +796,7 @@ def error_parameters(
         list[str] | None,
         typer.Argument(
             metavar="[NAME=VALUE]…",
-            help="New values; default: show the present values.",
+            help="New values; default: show the current values.",
             show_default=False,
         ),
     ] = None,
@@ -886,16 +891,16 @@ def _show_waiting(waiting: list[dict[str, Any]], as_json: bool = False) -> None:
     for change in waiting:
         print(
             f"change {change['number']} of {change['heliostat']}, requested by {change['author']} "
-            f"at {_utc(change['at'])}: {change['reason']}; it ends at {_utc(change['until'])}"
+            f"at {_utc(change['at'])}: {change['reason']}; it expires at {_utc(change['until'])}"
         )
         if change["version"]:
-            print(f"version {change['version']} again")
+            print(f"this restores version {change['version']}")
         rows = []
         for parameter in change["parameters"]:
             unit, size = _SHOWN[parameter["unit"]]
             shown = (f"{parameter[key] / size:.3f}" for key in ("now", "asked"))
             rows.append((parameter["name"], *shown, unit))
-        print_table(("parameter", "in use", "asked for", "unit"), rows)
+        print_table(("parameter", "in use", "requested", "unit"), rows)
         if change["beam_rms"] is not None:
             print(
                 f"the beam moves by {1e3 * change['beam_rms']:.1f} mm RMS at its aim, at most "
@@ -910,34 +915,46 @@ def plant_file(
     context: typer.Context,
     check: Annotated[
         Path | None,
-        typer.Option("--check", help="File whose text is checked.", show_default=False),
+        typer.Option("--check", help="File to check.", show_default=False),
     ] = None,
     store: Annotated[
         Path | None,
-        typer.Option(
-            "--store", help="File whose text replaces the plant file.", show_default=False
-        ),
+        typer.Option("--store", help="New file that replaces the plant file.", show_default=False),
     ] = None,
     versions: Annotated[bool, typer.Option("--versions", help="List the stored versions.")] = False,
     version: Annotated[str, typer.Option(help="Print this stored version.")] = "",
     waiting: Annotated[
-        bool, typer.Option("--waiting", help="Show the text that waits for a second engineer.")
+        bool,
+        typer.Option(
+            "--waiting", help="Show the new file that awaits a second engineer's approval."
+        ),
     ] = False,
     approve: Annotated[
-        int, typer.Option(min=0, max=2**53, help="Approve the waiting text of this number.")
+        int, typer.Option(min=0, max=2**53, help="Approve the waiting file with this number.")
     ] = 0,
-    refuse: Annotated[int, typer.Option(min=0, max=2**53, help="Refuse it; needs --reason.")] = 0,
-    withdraw: Annotated[int, typer.Option(min=0, max=2**53, help="Withdraw your own.")] = 0,
-    reason: Annotated[str, typer.Option(help="Reason, recorded with a new text.")] = "",
+    refuse: Annotated[
+        int,
+        typer.Option(
+            min=0, max=2**53, help="Refuse the waiting file with this number; needs --reason."
+        ),
+    ] = 0,
+    withdraw: Annotated[
+        int, typer.Option(min=0, max=2**53, help="Withdraw your own waiting file with this number.")
+    ] = 0,
+    reason: Annotated[
+        str, typer.Option(help="Reason for the change, recorded with the new file.")
+    ] = "",
     replaces: Annotated[
-        str, typer.Option(help="Version of the text that was changed; default: the present one.")
+        str,
+        typer.Option(help="Version that the new file was edited from; default: the current one."),
     ] = "",
     as_json: Json = False,
 ) -> None:
-    """Print the plant file as the running plant has it; check or store a new text.
+    """Print the plant file that the running plant uses; check or store a new one.
 
-    Nothing moves. A text that changes only views of cameras and marks on targets is used at once,
-    and then needs the command authority; any other text takes effect when the plant restarts.
+    Nothing moves. A file that changes only views of cameras and marks on targets takes effect at
+    once, and then needs the command authority; any other change takes effect when the plant
+    restarts.
     """
     chosen = (check, store, versions, version, waiting, approve, refuse, withdraw)
     if sum(map(bool, chosen)) > 1:
@@ -990,10 +1007,14 @@ def _check_plant_file(client: "AtPlant | Client", path: Path, as_json: bool) -> 
         for one in found["findings"]:
             line = f"line {one['line']}: " if one["line"] else ""
             print(f"{one['severity']}: {line}{one['text']}")
-        print("\n".join(found["difference"]) or "no difference from the present file")
+        print("\n".join(found["difference"]) or "no difference from the current file")
         _print_differs(found["differs"])
         if found["good"]:
-            print("used at once" if found["at_once"] else "takes effect when the plant restarts")
+            print(
+                "takes effect immediately"
+                if found["at_once"]
+                else "takes effect when the plant restarts"
+            )
     if not found["good"]:
         raise typer.Exit(1)
 
@@ -1014,11 +1035,11 @@ def _show_plant_file(view: dict[str, Any], versions: bool, waiting: bool, as_jso
     elif not waiting:
         print(view["text"], end="")
     elif (one := view["waiting"]) is None:
-        print("no text is waiting for approval")
+        print("no file is waiting for approval")
     else:
         print(
             f"change {one['number']} of the plant file, requested by {one['author']} at "
-            f"{_utc(one['at'])}: {one['reason']}; it ends at {_utc(one['until'])}"
+            f"{_utc(one['at'])}: {one['reason']}; it expires at {_utc(one['until'])}"
         )
         print("\n".join(one["difference"]))
 
@@ -1052,7 +1073,7 @@ def _show_parameters(answer: dict[str, Any], as_json: bool) -> None:
         rows.append((parameter["name"], *shown, unit))
     head = ("parameter", "plant file", "in use", "σ", "σ installed", "unit")
     print_table(head, rows, f"{answer['heliostat']}, version {answer['version']}")
-    print(f"stored by its local controller: {answer['stored']}")
+    print(f"stored in its local controller: {answer['stored']}")
     lines = [
         (str(e["version"]), _utc(e["at"]), e["person"], str(e["sightings"]), e["note"])
         for e in answer["earlier"]
@@ -1274,10 +1295,15 @@ def timetable(
     target: Annotated[str, typer.Option(help="Target; default: any.")] = "",
     at: Annotated[
         list[str] | None,
-        typer.Option(help="Time of day: 08:30Z, 10:30+02:00.", show_default=False),
+        typer.Option(
+            help="Time of day with its zone, such as 08:30Z or 10:30+02:00.", show_default=False
+        ),
     ] = None,
     every: Annotated[
-        str, typer.Option(help="Interval from midnight UTC: 10min, 2h.", show_default=False)
+        str,
+        typer.Option(
+            help="Interval counted from midnight UTC, such as 10min or 2h.", show_default=False
+        ),
     ] = "",
     rule: Annotated[
         str,
@@ -1387,7 +1413,7 @@ def give_back(
     receivers: LockedReceivers = None,
     tower: LockedTower = False,
     owner: Annotated[
-        str, typer.Option(help="As an engineer: the user whose lock to remove; needs --reason.")
+        str, typer.Option(help="Engineers only: the user whose lock is removed; needs --reason.")
     ] = "",
     reason: Annotated[str, typer.Option(help="Reason for removing another user's lock.")] = "",
 ) -> None:
@@ -1396,7 +1422,7 @@ def give_back(
     with _client(context) as client:
         left = client.ask("POST", "holds/release", order)
     locked = ", ".join(f"{one['name']} ({one['who']}: {one['reason']})" for one in left)
-    print(f"lock removed; still locked: {locked}" if left else "lock removed; none is left")
+    print(f"lock removed; still locked: {locked}" if left else "lock removed; no lock is left")
 
 
 def _places(
@@ -1429,7 +1455,7 @@ def resume(context: typer.Context) -> None:
     waits = holder and holder != "automatic control"
     print(
         "automatic control resumed"
-        + (f"; it goes on as soon as {holder} releases command" if waits else "")
+        + (f"; it continues as soon as {holder} releases command authority" if waits else "")
     )
 
 

@@ -13,7 +13,9 @@ if TYPE_CHECKING:
 
 
 def layout(
-    kind: Annotated[str, typer.Argument(help="six-packs, twin-field, radial or rows.")],
+    kind: Annotated[
+        str, typer.Argument(help="Kind of layout: six-packs, twin-field, radial or rows.")
+    ],
     out: Annotated[Path, typer.Option("--out", help="Plant file to write (TOML).")],
     heliostats: Annotated[
         int, typer.Option(min=1, max=1_000_000, help="Number of heliostats.")
@@ -53,7 +55,7 @@ def layout(
         str, typer.Option(help="Format of the heliostat table: csv or parquet.")
     ] = "csv",
     picture: Annotated[
-        Path | None, typer.Option(help="Draw the field to this file (PNG, SVG or PDF).")
+        Path | None, typer.Option(help="Draw the field into this file (PNG, SVG or PDF).")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:

@@ -68,7 +68,7 @@ def rotate(file: PlantFile, clusters: Clusters, to: FolderOption) -> None:
     keys = _open(file)
     carried_files(to, clusters)  # refuses before anything is written
     _carry(to, keys.rotate(clusters))
-    print(f"{file}: new keys beside the old ones for {', '.join(clusters)}")
+    print(f"{file}: new keys created, old keys still valid, for {', '.join(clusters)}")
 
 
 @app.command()
@@ -123,7 +123,10 @@ def list_(
 def tls(
     folder: Annotated[Path, typer.Argument(help="Folder for the keys and certificates.")],
     name: Annotated[
-        list[str], typer.Option(help="Host name or address that users type; may be repeated.")
+        list[str],
+        typer.Option(
+            help="Host name or address at which users reach the console; may be repeated."
+        ),
     ],
     days: Annotated[
         int, typer.Option(min=1, max=825, help="Validity of the certificate, days.")
@@ -131,7 +134,8 @@ def tls(
     request: Annotated[
         bool,
         typer.Option(
-            "--request", help="Create a certificate request for another authority instead."
+            "--request",
+            help="Instead create a certificate request, to be signed by another authority.",
         ),
     ] = False,
 ) -> None:
@@ -146,10 +150,13 @@ def tls(
             f"keys: {error.name} is not installed; run pip install 'heliotrope[control]'"
         ) from None
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; create it with access for its owner only")
+        raise InputError(f"{folder}: no such folder; create it so that only its owner can read it")
     if request:
         made = certificates.request(folder, name)
-        print(f"{made.certificate}: have it signed; the key {made.key} stays here")
+        print(
+            f"{made.certificate}: have it signed by your authority; the key {made.key} stays on "
+            "this computer"
+        )
         return
     made = certificates.certify(folder, name, parse_time("now"), days=days)
     print(f"{made.certificate}, {made.key}: pass them to heliotrope run as --certificate and --key")
@@ -200,7 +207,10 @@ def bus_off(file: BusFile) -> None:
     """Remove all keys; the cluster then removes them from local controllers that are at rest."""
     keys = _bus(file)
     keys.off()
-    print(f"{file}: no key left; each local controller drops its key once its mirrors are at rest")
+    print(
+        f"{file}: no key remains; each local controller deletes its key once its mirrors are at "
+        "rest"
+    )
 
 
 @bus_app.command(name="list")

@@ -42,7 +42,7 @@ Slope = Annotated[
     typer.Option(
         min=0,
         max=50,
-        help="Slope error of the surface per axis, mrad. Default: of the plant file, or 1.",
+        help="Slope error of the surface per axis, mrad. Default: from the plant file, or 1.",
     ),
 ]
 Error = Annotated[
@@ -51,31 +51,37 @@ Error = Annotated[
 Reflectivity = Annotated[
     float | None,
     typer.Option(
-        min=0, max=1, help="Reflectivity of a clean mirror. Default: of the plant file, or 0.9."
+        min=0, max=1, help="Reflectivity of a clean mirror. Default: from the plant file, or 0.9."
     ),
 ]
 Clean = Annotated[
-    float, typer.Option(min=0, max=1, help="Fraction of the reflectivity left after soiling.")
+    float,
+    typer.Option(
+        min=0,
+        max=1,
+        help="Cleanliness: fraction of the reflectivity that remains when the mirrors are soiled.",
+    ),
 ]
 Focus = Annotated[
     str,
     typer.Option(
-        help="Focus: plant (as in the plant file, or slant), slant, flat, or the focal length of "
-        "all mirrors, m."
+        help="Focal length of all mirrors in m; or slant (the slant range), flat, or plant (as "
+        "in the plant file; slant if it gives none)."
     ),
 ]
 FacetOption = Annotated[
-    str | None, typer.Option(help="Columns and rows of equal facets, such as 5x7.")
+    str | None, typer.Option(help="Number of columns and rows of equal facets, such as 5x7.")
 ]
 CantingOption = Annotated[
     str,
     typer.Option(
-        help="Canting of these facets: slant, a focal length in m, or the time for which they "
-        "are canted off-axis."
+        help="Canting of these facets: slant (the slant range), a focal length in m, or the time "
+        "for which they are canted off-axis."
     ),
 ]
 CellOption = Annotated[
-    str | None, typer.Option(help="Rows and columns of each receiver, such as 20x56.")
+    str | None,
+    typer.Option(help="Number of rows and columns of flux cells on each receiver, such as 20x56."),
 ]
 Towers = Annotated[
     list[str] | None,
@@ -131,7 +137,7 @@ def _facets(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,2})x(\d{1,2})", text, re.ASCII)
     if match is None:
         raise InputError(
-            f"--facets {shown(text)}: write COLUMNSxROWS, such as 5x7, from 1 to 50 each way"
+            f"--facets {shown(text)}: write COLUMNSxROWS, such as 5x7, each number from 1 to 50"
         )
     return int(match[1]), int(match[2])
 
@@ -144,7 +150,7 @@ def canting_of(text: str, facets: tuple[int, int] | None, plant: "Plant") -> Any
         return text
     if facets is None:
         raise InputError(
-            "--canting: applies to the facets of --facets; add --facets COLUMNSxROWS, such as 5x7, "
+            "--canting applies only with --facets; add --facets COLUMNSxROWS, such as 5x7, "
             "or specify the canting in the plant file"
         )
     if re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?", text, re.ASCII):

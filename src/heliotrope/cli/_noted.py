@@ -47,7 +47,7 @@ def note_use(place: str, kind: str, detail: str) -> None:
 def _ask_plant(place: str, kind: str, detail: str) -> None:
     folder = os.environ.get(_PLANT, "") if "://" in place else place
     if not folder:
-        raise AwayError(f"the folder of a running plant is not specified; set {_PLANT} to it")
+        raise AwayError(f"the data folder of the running plant is unknown; set {_PLANT} to it")
     socket = socket_folder(Path(folder)) / ORDINARY
     ask_once(socket, {"user": True}, "note_use", {"kind": kind, "detail": detail})
 

@@ -17,7 +17,7 @@ def one_plant(command: str, field: Path | None, heliostats: int | None, *, proto
 
     if prototype and (field is not None or heliostats is not None):
         raise InputError(
-            f"{command}: --prototype is a plant of its own; leave out the field and --heliostats"
+            f"{command}: --prototype already selects a plant; leave out the field and --heliostats"
         )
     if field is not None and heliostats is not None:
         raise InputError(

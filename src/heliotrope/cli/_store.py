@@ -48,7 +48,7 @@ def info(place: Place, as_json: JsonOption = False) -> None:
     if rows:
         print_table(["table", "rows"], [[name, str(count)] for name, count in rows.items()])
     else:
-        print("its tables have another revision: run `heliotrope store migrate`")
+        print("its tables have a different revision; run `heliotrope store migrate`")
 
 
 @app.command()
@@ -57,7 +57,7 @@ def backup(
     to: Annotated[Path, typer.Option("--to", help="Folder to create.")],
     telemetry: TelemetryOption = None,
     without_telemetry: Annotated[
-        bool, typer.Option("--without-telemetry", help="Leave the telemetry out.")
+        bool, typer.Option("--without-telemetry", help="Leave out the telemetry.")
     ] = False,
     sign: Annotated[
         Path | None, typer.Option(help="Private key created by `store key`, to sign the backup.")
@@ -88,9 +88,7 @@ def restore(
     ] = None,
     unsigned: Annotated[
         bool,
-        typer.Option(
-            "--unsigned", help="Restore the backup without checking its signature, whoever made it."
-        ),
+        typer.Option("--unsigned", help="Restore the backup without checking its signature."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -196,8 +194,8 @@ def verify(
     head: Annotated[
         list[str] | None,
         typer.Option(
-            help="File of exported heads (heads, or a syslog file), or the output of an "
-            "earlier `store head`; may be repeated."
+            help="Hash-chain heads to compare with: a file of exported heads, a syslog file, or "
+            "the output of an earlier `store head`; may be repeated."
         ),
     ] = None,
 ) -> None:
@@ -222,7 +220,7 @@ def verify(
             result = chain.verify(connection, [*known, *exported])
     if head:
         all_of = len(result.fitting) + len(result.old)
-        old = ", heads of earlier events could not be checked" if result.old else ""
+        old = ", heads of events older than that could not be checked" if result.old else ""
         print(
             f"{len(result.fitting)} of {all_of} heads match; {chain.kept_since(result.since)}{old}"
         )
@@ -232,7 +230,7 @@ def verify(
 @app.command()
 def query(
     place: Annotated[Path, typer.Argument(help="Data folder of a plant, or its telemetry.")],
-    sql: Annotated[str, typer.Argument(help="One SELECT from telemetry.")],
+    sql: Annotated[str, typer.Argument(help="A single SELECT statement on the telemetry.")],
     as_json: JsonOption = False,
 ) -> None:
     """Query the telemetry archive in SQL (DuckDB)."""

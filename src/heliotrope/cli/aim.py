@@ -62,7 +62,10 @@ def aim(
     ],
     panels: Annotated[
         Path | None,
-        typer.Option(help="Panels with the fluid's state (CSV); --limit is then a table (CSV)."),
+        typer.Option(
+            help="Receiver panels with the state of their fluid (CSV); --limit must then be a CSV "
+            "table of allowable flux."
+        ),
     ] = None,
     margin: Annotated[
         float, typer.Option(min=0, max=0.5, help="Fraction of the limit reserved for model error.")
@@ -73,7 +76,9 @@ def aim(
     ] = 0.99,
     strategy: Annotated[
         Literal["optimal", "middle", "spread", "image-size", "gradient", "all"],
-        typer.Option(help="Only optimal keeps the limit; the others are for comparison."),
+        typer.Option(
+            help="Aiming strategy; only optimal respects the limit, the others are for comparison."
+        ),
     ] = "optimal",
     keep_all: Annotated[
         bool, typer.Option("--keep-all", help="Fail rather than defocus a heliostat.")
@@ -86,12 +91,14 @@ def aim(
     ] = "",
     give_percent: Annotated[
         float,
-        typer.Option(min=0, max=50, help="Largest loss of power to reach the desired flux, %."),
+        typer.Option(
+            min=0, max=50, help="Largest power loss accepted for reaching the desired flux, %."
+        ),
     ] = 1.0,
     ramp: Annotated[
         float | None,
         typer.Option(
-            min=0.001, max=64000, help="Start-up: largest rise of flux, kW/m² per minute."
+            min=0.001, max=64000, help="Start-up: maximum rate of flux increase, kW/m² per minute."
         ),
     ] = None,
     without: Annotated[
@@ -99,16 +106,24 @@ def aim(
     ] = None,
     drift_mrad: Annotated[
         float,
-        typer.Option(min=0, max=50, help="Rotation common to all mirror normals, mrad per axis."),
+        typer.Option(
+            min=0,
+            max=50,
+            help="Standard deviation of an error common to all mirror normals, mrad per axis.",
+        ),
     ] = 0.0,
     cluster_mrad: Annotated[
         float,
         typer.Option(
-            min=0, max=50, help="Rotation common to a cluster's mirror normals, mrad per axis."
+            min=0,
+            max=50,
+            help="Standard deviation of an error common to all mirror normals of a cluster, mrad "
+            "per axis.",
         ),
     ] = 0.0,
     clock_s: Annotated[
-        float, typer.Option(min=0, max=600, help="Error of the field clock, s.")
+        float,
+        typer.Option(min=0, max=600, help="Standard deviation of the field clock's error, s."),
     ] = 0.0,
     time: Time = None,
     sun: Sun = None,
@@ -174,7 +189,7 @@ def aim(
     _print(plans, chosen)
     if options["wanted"] is not None:
         far = chosen.deviation(options["wanted"])
-        print(f"the flux differs from the wanted one by {100 * far:.1f} % of its mean (RMS)")
+        print(f"the flux differs from the desired flux by {100 * far:.1f} % of its mean (RMS)")
     if joins is not None:
         _print_ramp(chosen, joins)
     for name, path in files.items():
@@ -284,7 +299,7 @@ def _print(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> None:
         "peak, kW/m²",
         "over the limit",
         "defocused",
-        "best at most",
+        "possible gain",
     ]
     rows = []
     for row in compare_aims(plans):
@@ -302,21 +317,21 @@ def _print(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> None:
     for mask, one, many in (
         (chosen.lost_mirrors, "is lost", "are lost"),
         (chosen.elsewhere, "belongs to another receiver", "belong to other receivers"),
-        (chosen.unlit, "reaches no cell of the receiver", "reach no cell of the receiver"),
+        (chosen.unlit, "reaches no receiver cell", "reach no receiver cell"),
     ):
         count = int(mask.sum())
         first = chosen.names[int(mask.argmax())]
         if count == 1:
-            print(f"1 heliostat {one}, {first}")
+            print(f"1 heliostat {one}: {first}")
         elif count:
-            print(f"{count:,} heliostats {many}, {first} first")
+            print(f"{count:,} heliostats {many}; the first is {first}")
     _print_binding(chosen)
     best = np.argsort(-chosen.gain)[:NAMED]
     words = [
         f"{chosen.names[k]} {1e-3 * chosen.gain[k]:.3g} kW" for k in best if chosen.gain[k] > 0
     ]
     if words:
-        print(f"calibration would gain most at {', '.join(words)}")
+        print(f"calibration would gain the most power at {', '.join(words)}")
 
 
 def _print_binding(chosen: "AimPlan") -> None:

@@ -24,7 +24,9 @@ def calibrate(
     fraction: Annotated[
         float,
         typer.Option(
-            min=0.01, max=1, help="Fraction of the sightings to learn from in the test; 1: no test."
+            min=0.01,
+            max=1,
+            help="Fraction of the sightings to fit when testing on the others; 1: no test.",
         ),
     ] = 0.7,
     seed: shared.SeedOption = 0,
@@ -122,7 +124,7 @@ def _print(content: "CalibrationReport") -> None:
     if a is not None and math.isfinite(a.median_of_medians):
         print(
             f"median of the held-out medians (heliostats with {a.fewest} or more): "
-            f"{1e3 * a.median_of_medians:.2f} mrad of beam; {100 * a.coverage:.0f} % within the "
+            f"{1e3 * a.median_of_medians:.2f} mrad beam error; {100 * a.coverage:.0f} % within the "
             "90 % ellipse"
         )
     for line in (*content.remarks, *content.comparison):

@@ -48,14 +48,18 @@ def calibrate(
     ] = None,
     anew: Annotated[
         bool,
-        typer.Option("--anew", help="With marks: solve for the lens again even if it is known."),
+        typer.Option(
+            "--anew", help="With marks: estimate the lens parameters again even if they are known."
+        ),
     ] = False,
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate a lens with a chessboard, or the lens and pose with the marks of targets."""
     if (chessboard is None) != (square is None):
-        raise InputError("--chessboard and --square go together: --chessboard 9x6 --square 0.03")
+        raise InputError(
+            "use --chessboard and --square together, for example --chessboard 9x6 --square 0.03"
+        )
     board = None if chessboard is None or square is None else (_pattern(chessboard), square)
     place = _place_to_write(plant, out)
     loaded = open_plant(plant)
@@ -69,7 +73,9 @@ def calibrate(
 def _pattern(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,3})\s*[x×X]\s*(\d{1,3})", text)
     if not match:
-        raise InputError(f"--chessboard {text!r}: write the inner corners as 9x6")
+        raise InputError(
+            f"--chessboard {text!r}: write the number of inner corners as COLUMNSxROWS, such as 9x6"
+        )
     return int(match[1]), int(match[2])
 
 
@@ -101,8 +107,8 @@ def _show_lens(lens: "Lens", camera: "Camera", place: Path, as_json: bool, forgo
     notes = list(lens.notes)
     if forgotten:
         notes.append(
-            "the camera's pose was found with the old lens and is dropped; find it again with "
-            "heliotrope camera calibrate without --chessboard, or with teach"
+            "the camera's pose was found with the old lens parameters and has been removed; "
+            "find it again with heliotrope camera calibrate without --chessboard, or with teach"
         )
     if as_json:
         boards = [
@@ -174,7 +180,10 @@ def _from_marks(
     sizes = {frame.size for frame in frames} | ({old.size} if old else set())
     if len(sizes) > 1:
         listed = ", ".join(f"{w} × {h}" for w, h in sorted(sizes))
-        raise InputError(f"camera {name}: frames of {listed} px; use pictures of one size")
+        raise InputError(
+            f"camera {name}: the pictures have different sizes ({listed} px); use pictures of "
+            "one size"
+        )
     marks = teaching.see_marks(plant, places[0].parent, frames, old)
     fit = teaching.fit_marks(frames[0].size, marks, old, name, anew)
     camera = replace(
@@ -228,7 +237,8 @@ def teach(
         typer.Option(min=0.001, max=1000, help="Standard deviation of the specified points, px."),
     ] = 1.0,
     anew: Annotated[
-        bool, typer.Option("--anew", help="Solve for the lens again even if it is known.")
+        bool,
+        typer.Option("--anew", help="Estimate the lens parameters again even if they are known."),
     ] = False,
     out: OutOption = None,
     as_json: JsonOption = False,
@@ -273,7 +283,7 @@ def _announcer(quiet: bool) -> Callable[[str], None]:
 
 def _at(text: str) -> tuple[str, tuple[float, float]]:
     name, sign, pair = text.rpartition("=")
-    refusal = f"--at {text!r}: write NAME=X,Y in pixels, as upper_left=812.5,304"
+    refusal = f"--at {text!r}: write NAME=X,Y in pixels, such as upper_left=812.5,304"
     if not sign or not name:
         raise InputError(refusal)
     x, y = parse_numbers(pair, refusal, count=2)
@@ -383,14 +393,17 @@ def receiver(
     ],
     lit: Annotated[
         list[str],
-        typer.Option(help="Picture with beams, FILE=FRACTION of the nominal flux, as a.png=0.1."),
+        typer.Option(
+            help="Picture with beams and its flux as a fraction of nominal: FILE=FRACTION, "
+            "such as a.png=0.1."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", help="File to write (TOML), with a PNG beside it.")],
     outline: Annotated[
         list[str] | None,
         typer.Option(
-            help="Corner of the receiver in the picture, X,Y in pixels, in order around "
-            "it; default: from the camera position."
+            help="Corner of the receiver in the picture, X,Y in pixels; give all corners in "
+            "order around the receiver. Default: from the camera position."
         ),
     ] = None,
     gamma: Annotated[
@@ -438,7 +451,7 @@ def receiver(
         return
     print(
         f"receiver {surface.name} in camera {eye.name}: nominal flux uses "
-        f"{100 * reference.rise:.0f} % of the scale; daylight on the receiver reads as "
+        f"{100 * reference.rise:.0f} % of the pixel range; daylight on the receiver reads as "
         f"{100 * reference.daylight:.1f} % of nominal and is subtracted"
     )
     print(f"reference written to {out}")
@@ -453,14 +466,14 @@ def _outline(texts: Sequence[str], camera: "Camera", receiver: "Receiver") -> An
     if camera.position is None or receiver.kind != "planar":
         raise InputError(
             f"camera {camera.name}: receiver {receiver.name} is not planar, or the camera's "
-            "position is unknown; specify --outline X,Y for three corners or more"
+            "position is unknown; specify --outline X,Y for at least three corners"
         )
     return project(camera, receiver.face.corners)
 
 
 def _lit_frame(text: str) -> "tuple[Frame, float]":
     name, sign, share = text.rpartition("=")
-    refusal = f"--lit {text!r}: write FILE=SHARE, as lit.png=0.1"
+    refusal = f"--lit {text!r}: write FILE=FRACTION, such as lit.png=0.1"
     if not sign or not name:
         raise InputError(refusal)
     (value,) = parse_numbers(share, refusal)
@@ -506,7 +519,7 @@ def show(
     ]
     if table:
         print_table(
-            ["camera", "target", "distance m", "mm/px", "oblique °", "in the frame %", "marks"],
+            ["camera", "target", "distance m", "mm/px", "obliquity °", "in frame %", "marks"],
             table,
         )
     for camera in loaded.cameras:
@@ -629,8 +642,8 @@ def _print_fit(fit: "CameraFit", count: int, what: str) -> None:
     place = ", ".join(f"{v:.2f} ± {fit.sigma(name):.2f}" for v, name in names)
     rms = float(np.sqrt(np.mean(np.sum(fit.residuals**2, axis=1))))
     print(
-        f"{count} {what}, residuals {rms:.2f} px; pixels on their plane accurate to "
-        f"{1e3 * fit.plane_sigma:.1f} mm"
+        f"{count} {what}, residuals {rms:.2f} px; pixel positions on the target plane are "
+        f"accurate to {1e3 * fit.plane_sigma:.1f} mm"
     )
     print(f"camera at ({place}) m; focal length {fit.camera.matrix[0, 0]:.1f} px")
     _print_notes(fit.notes)

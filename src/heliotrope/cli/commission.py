@@ -38,7 +38,7 @@ def commission(
     installed_mrad: Annotated[
         float,
         typer.Option(
-            min=0.001, max=1000, help="Expected beam error before any measurement, mrad RMS."
+            min=0.001, max=1000, help="Expected beam error before the first measurement, mrad RMS."
         ),
     ] = 15.0,
     target: Annotated[
@@ -64,7 +64,9 @@ def commission(
     shots: Annotated[int, typer.Option(min=1, max=1000, help="Photographs in a single visit.")] = 3,
     interval: Annotated[str, typer.Option(help="Time per photograph.")] = "20s",
     settle: Annotated[str, typer.Option(help="Time of a visit excluding the photographs.")] = "20s",
-    look: Annotated[str, typer.Option(help="Time of each further search for a lost beam.")] = "20s",
+    look: Annotated[
+        str, typer.Option(help="Time of each further search for a beam not found.")
+    ] = "20s",
     sigma_mrad: Annotated[
         float,
         typer.Option(min=0.001, max=1000, help="Accuracy of a photograph per direction, mrad."),
@@ -78,7 +80,7 @@ def commission(
         typer.Option(
             min=0,
             max=1000,
-            help="Error that is not repeatable between visits, per direction, mrad.",
+            help="Error that differs from visit to visit, per direction, mrad.",
         ),
     ] = 0.0,
     drone: Annotated[
@@ -97,7 +99,9 @@ def commission(
     clear: Annotated[
         float, typer.Option(min=0.01, max=1, help="Fraction of the time without clouds.")
     ] = 1.0,
-    every: Annotated[str, typer.Option(help="Interval at which gains are computed.")] = "30m",
+    every: Annotated[
+        str, typer.Option(help="Interval at which the gain of each possible visit is computed.")
+    ] = "30m",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     csv: Annotated[Path | None, typer.Option("--csv", help="File for the visits.")] = None,
     page: Annotated[Path | None, typer.Option(help="HTML file for the report.")] = None,
@@ -306,7 +310,7 @@ def _tell(
     if flight is not None:
         print(
             f"before the first day: {flight['sorties']:,} flights of {flight['drones']} drones, "
-            f"{flight['hours']:.0f} h, {flight['calibration_points']} poses of each heliostat"
+            f"{flight['hours']:.0f} h, {flight['calibration_points']} poses per heliostat"
         )
     print(told.sentence(plan))
     for what, path in (("visits", csv), ("report", page), ("picture", picture)):
@@ -331,5 +335,6 @@ def _print_hours(rows: list[dict[str, Any]], plan: "CommissionPlan") -> None:
             ]
             for r in rows
         ],
-        title=f"beam errors in mrad; field before: median {middle:.2f}, 90 % {high:.2f}",
+        title=f"beam errors in mrad; field before the first visit: median {middle:.2f}, 90 % "
+        f"{high:.2f}",
     )

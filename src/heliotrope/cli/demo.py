@@ -47,7 +47,7 @@ def demo(
     days = tuple(DAY - timedelta(days=back) for back in range(7, 0, -2))
     with compiling():
         sightings = measure(group.mechanism, truth, target, plant.site, days, seed=seed)
-    say(f"measured: {len(sightings)} sightings on the target in the week before")
+    say(f"measured: {len(sightings)} sightings on the target in the preceding week")
     report = calibrate(FieldSightings(plant, "azel", sightings, (), ()), MODEL, seed=seed)
     calibrated = plant.with_calibration(report.results)
     write_plant(calibrated, into / "plant.toml")

@@ -19,7 +19,10 @@ def evaluate(
     place: shared.Place,
     split: shared.SplitOption = "random",
     fraction: Annotated[
-        float, typer.Option(min=0.01, max=0.999, help="Fraction of the sightings to learn from.")
+        float,
+        typer.Option(
+            min=0.01, max=0.999, help="Fraction of the sightings to fit; the others are the test."
+        ),
     ] = 0.7,
     seed: shared.SeedOption = 0,
     model: shared.ModelOption = "auto",
@@ -30,8 +33,8 @@ def evaluate(
     learner: Annotated[
         Literal["stream", "batch"],
         typer.Option(
-            help="How --split sequential continues learning: by one update per sighting, or "
-            "from scratch each time."
+            help="How --split sequential adds each sighting: by updating the last fit, or by "
+            "fitting from scratch."
         ),
     ] = "stream",
     neighbours: Annotated[
@@ -122,22 +125,23 @@ def _print_axes(document: dict[str, Any], shown: Callable[[Any], str]) -> None:
     print_table(
         ["heliostat", "γ₀", "σγ", "α₀", "σα"],
         rows,
-        title="each axis, mrad: zero before the fit, scatter after it (Guo (44)-(47))",
+        title="each axis, mrad: offset before the fit, scatter after it (Guo (44)-(47))",
     )
 
 
 def _print_left_out(document: dict[str, Any]) -> None:
     if document["unexplained_sightings"]:
         print(
-            f"no mechanism explains {', '.join(document['unexplained_sightings'])}; without them "
-            f"the mean of means is {document['mean_of_means_explained_mrad']:.2f} mrad"
+            "no mechanism explains the sightings "
+            f"{', '.join(document['unexplained_sightings'])}; without them the mean of means is "
+            f"{document['mean_of_means_explained_mrad']:.2f} mrad"
         )
     for line in document["unexplained_mirrors"]:
         print(line)
     if document["unusable_sightings"]:
         print(
-            f"left out: {', '.join(document['unusable_sightings'])}: counts outside the range of "
-            "the drives; check them against the measurement log"
+            f"left out: {', '.join(document['unusable_sightings'])}: motor counts are outside "
+            "the range of the drives; check them against the measurement log"
         )
 
 

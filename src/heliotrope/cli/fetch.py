@@ -11,10 +11,10 @@ from heliotrope.errors import UnknownNameError
 
 def fetch(
     source: Annotated[str, typer.Argument(help="Data set: juelich (PAINT).")],
-    heliostats: Annotated[list[str], typer.Argument(help="Names, for example AA39.")],
+    heliostats: Annotated[list[str], typer.Argument(help="Heliostat names, for example AA39.")],
     into: Annotated[Path, typer.Option(help="Folder for the files.")],
     base_url: Annotated[
-        str | None, typer.Option(help="Address of a mirror server for the catalogue.")
+        str | None, typer.Option(help="Address of a mirror server for the data catalogue.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:

@@ -101,7 +101,7 @@ def safety(
         )
         for setting in numbers
     ]
-    print_table(("number", "in force", "default", "range"), rows)
+    print_table(("setting", "in force", "default", "range"), rows)
 
 
 @app.command()
@@ -146,10 +146,10 @@ def defocus(
     if as_json:
         print_json(documents)
         return
-    heads = ("sun", "same angles", "as in the file", "above 10 suns")
+    heads = ("sun", "same angles", "as in the file", "10 suns exceeded")
     rows = [
         (
-            f"{row['azimuth_deg']:.0f}°, {row['elevation_deg']:.0f}° high",
+            f"az {row['azimuth_deg']:.0f}°, el {row['elevation_deg']:.0f}°",
             f"{row['same_suns']:.0f} suns, {row['same_m']:.0f} m away",
             f"{row['spread_suns']:.0f} suns, {row['spread_m']:.0f} m away",
             f"within {row['spread_reach_m']:.0f} m",
@@ -186,7 +186,7 @@ def change(
         list[str] | None,
         typer.Argument(
             metavar="[NAME=VALUE]…",
-            help="New values; default: show the present values.",
+            help="New values; default: show the current values.",
             show_default=False,
         ),
     ] = None,

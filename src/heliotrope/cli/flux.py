@@ -93,12 +93,12 @@ def flux(
     cells: CellOption = None,
     tower: Towers = None,
     rays: Annotated[
-        float, typer.Option(min=0, max=1e9, help="Trace this many rays as an independent check.")
+        float, typer.Option(min=0, max=1e9, help="Number of rays to trace as an independent check.")
     ] = 0.0,
     seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of the rays.")] = 0,
     by: Annotated[
         Literal["cosine", "shading", "blocking", "lit", "mirror", "air", "intercept", "total"],
-        typer.Option(help="Efficiency shown by colour in the picture."),
+        typer.Option(help="Efficiency that the picture shows by colour."),
     ] = "total",
     csv: Annotated[
         Path | None,
@@ -110,9 +110,9 @@ def flux(
     netcdf: Annotated[
         Path | None, typer.Option(help="File for heliostats and flux map, NetCDF.")
     ] = None,
-    sam: Annotated[Path | None, typer.Option(help="File for SAM, with --year.")] = None,
+    sam: Annotated[Path | None, typer.Option(help="File for SAM; only with --year.")] = None,
     solartherm: Annotated[
-        Path | None, typer.Option(help="File for SolarTherm (.motab), with --year.")
+        Path | None, typer.Option(help="File for SolarTherm (.motab); only with --year.")
     ] = None,
     picture: Annotated[
         Path | None, typer.Option(help="File for the picture, .png, .svg or .pdf.")
@@ -168,7 +168,9 @@ class _Order:
         for name in barred:
             if name in self.files:
                 needs = "--year" if name in ("sam", "solartherm") else "one time"
-                raise InputError(f"--{name}: this file is written only for {needs}; leave it out")
+                raise InputError(
+                    f"--{name}: this file is written only for {needs}; leave out --{name}"
+                )
 
     @property
     def options(self) -> dict[str, Any]:
@@ -184,9 +186,9 @@ class _Order:
 def _refuse(what: str, any_of: dict[str, str | None], rays: float) -> None:
     for name, value in any_of.items():
         if value is not None:
-            raise InputError(f"{name}: {what} takes no {name}; leave it out")
+            raise InputError(f"{name} cannot be used with {what}; leave it out")
     if rays:
-        raise InputError(f"--rays: {what} cannot be traced; specify one time")
+        raise InputError(f"--rays: {what} cannot be ray-traced; specify one time")
 
 
 def _moment(
@@ -303,7 +305,7 @@ def _print_moment(result: "PlantFlux", second: "PlantFlux | None") -> None:
             rows[-1].append(_percent(second.summary[name]))
     if second is not None:
         header.append("by rays")
-    title = f"{result.plant}: sun {azimuth:.2f}° from north, {elevation:.2f}° high, "
+    title = f"{result.plant}: sun azimuth {azimuth:.2f}°, elevation {elevation:.2f}°, "
     title += f"{result.dni:g} W/m² on {result.area.sum():,.0f} m²"
     print_table(header, rows, title=title)
     for view in result.maps:
@@ -311,18 +313,18 @@ def _print_moment(result: "PlantFlux", second: "PlantFlux | None") -> None:
         power = view.power if view.power > 1e-6 * result.power else 0.0
         line = f"{view.receiver}: {1e-6 * power:.5g} MW, peak {1e-3 * view.flux.max():.5g} kW/m²"
         if np.isfinite(view.intercept):
-            line += f", {100 * max(view.intercept, 0.0):.2f} % of the light"
+            line += f", {100 * max(view.intercept, 0.0):.2f} % of the reflected light"
         print(line)
     dark = int(np.isnan(result.efficiencies.cosine).sum())
     if dark:
-        print(f"{dark} of {len(result.names)} heliostats cannot reach their aim")
+        print(f"{dark} of {len(result.names)} heliostats cannot reach their aim point")
     if second is not None:
         said = _second(result, second)
         print(
             f"by {second.rays:,} rays: {1e-6 * said['power_w']:.5g} ± "
             f"{1e-6 * said['power_error_w']:.2g} MW, peak {1e-3 * second.peak:.5g} kW/m²; cells "
-            f"differ by {100 * said['cells_apart_of_peak']:.2f} % of the peak (RMS), the rays' own "
-            f"noise is {100 * said['cells_noise_of_peak']:.2f} %"
+            f"differ by {100 * said['cells_apart_of_peak']:.2f} % of the peak (RMS), "
+            f"the ray noise is {100 * said['cells_noise_of_peak']:.2f} %"
         )
 
 

@@ -33,7 +33,8 @@ _OFTEN = 20
 
 def image(
     paths: Annotated[
-        list[str], typer.Argument(help="Photographs or folders; with --live a single source.")
+        list[str],
+        typer.Argument(help="Photographs or folders of photographs; with --live, a single source."),
     ],
     plant: Annotated[
         Path, typer.Option(help="Plant file or folder, or PAINT's tower-measurements.json.")
@@ -42,12 +43,13 @@ def image(
     crop: Annotated[
         bool, typer.Option("--crop", help="Each picture shows exactly one target.")
     ] = False,
-    camera: Annotated[str, typer.Option(help="Camera that took them.")] = "",
+    camera: Annotated[str, typer.Option(help="Camera that took the photographs.")] = "",
     empty: Annotated[
-        Path | None, typer.Option(help="Photograph by the same camera without the beam.")
+        Path | None, typer.Option(help="Photograph from the same camera without the beam.")
     ] = None,
     memory: Annotated[
-        Path | None, typer.Option(help="Folder of empty-target models, updated with --live.")
+        Path | None,
+        typer.Option(help="Folder with models of the empty targets; --live updates them."),
     ] = None,
     annotated: Annotated[Path | None, typer.Option(help="Folder for annotated pictures.")] = Path(
         "out/image"
@@ -70,7 +72,10 @@ def image(
     scheduler: shared.SchedulerOption = None,
     live: Annotated[
         bool,
-        typer.Option("--live", help="Follow a watched folder, video, rtsp://, http://, usb:0."),
+        typer.Option(
+            "--live",
+            help="Follow a live source: a watched folder, a video, rtsp://, http:// or usb:0.",
+        ),
     ] = False,
     limit: Annotated[
         int | None,
@@ -143,7 +148,7 @@ def _follow(
 
     if len(paths) != 1:
         raise InputError(
-            f"--live follows one source, but {len(paths)} were specified; name only one"
+            f"--live follows a single source, but {len(paths)} were specified; specify one"
         )
     # A plant camera may be specified by its name.
     named = next((c for c in place.cameras if c.name == paths[0]), None)
@@ -346,7 +351,7 @@ def print_spots(outcomes: "Sequence[Outcome]") -> None:
             for k, spot in enumerate(reading["spots"], start=1):
                 print(f"    spot {k}{_numbers(spot)}")
         for spot in outcome.document["beside_the_targets"]:
-            print(f"  beside the targets\n    spot  {_numbers(spot)}")
+            print(f"  outside the targets\n    spot  {_numbers(spot)}")
 
 
 def _numbers(spot: "dict[str, Any]") -> str:

@@ -16,10 +16,13 @@ Names = Literal["guo", "malan", "heliotrope"]
 def parameters(
     values: Annotated[
         list[str],
-        typer.Argument(help="NAME=VALUE: Guo's in °, the others in mrad; lengths in m."),
+        typer.Argument(
+            help="Parameters as NAME=VALUE: angles in ° for Guo's parameters and in mrad for the "
+            "others, lengths in m."
+        ),
     ],
     source: Annotated[
-        Names, typer.Option("--from", help="Whose parameter names the values use.")
+        Names, typer.Option("--from", help="Convention of the parameter names.")
     ] = "guo",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
@@ -39,9 +42,9 @@ def parameters(
         for name, value in converted.items()
         if isinstance(value, float)
     ]
-    print_table(["in the names of", "parameter", "value"], rows)
+    print_table(["convention", "parameter", "value"], rows)
     if "reason" in document["malan"]:
-        print(f"not in Malan's parameters: {document['malan']['reason']}")
+        print(f"cannot be expressed in Malan's parameters: {document['malan']['reason']}")
 
 
 def _parsed(values: list[str]) -> dict[str, float]:

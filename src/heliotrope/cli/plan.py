@@ -48,7 +48,8 @@ def plan(
         typer.Option(
             min=1,
             max=100_000,
-            help="Measurements per heliostat (default 10), or in the campaign (no limit).",
+            help="Maximum number of measurements: per heliostat (default 10), or with --campaign "
+            "in total (default no limit).",
         ),
     ] = None,
     target: Annotated[
@@ -58,7 +59,10 @@ def plan(
         str, typer.Option(help="auto, jacks, malan8, guo6, khalsa8 or full.")
     ] = "auto",
     criterion: Annotated[
-        Literal["d", "v"], typer.Option(help="d: most information; v: smallest beam error.")
+        Literal["d", "v"],
+        typer.Option(
+            help=("What measurements are chosen for: d, most information; v, smallest beam error.")
+        ),
     ] = "d",
     sightings: Annotated[
         Path | None, typer.Option(help="Table of the sightings made so far.")
@@ -66,7 +70,8 @@ def plan(
     campaign: Annotated[
         bool,
         typer.Option(
-            "--campaign", help="Schedule the whole field, with one beam on a target at a time."
+            "--campaign",
+            help="Schedule the whole field, with only one beam on each target at a time.",
         ),
     ] = False,
     every: Annotated[str, typer.Option(help="Step between the times considered.")] = "30m",
@@ -83,7 +88,9 @@ def plan(
     clear: Annotated[str, typer.Option(help="Time for the beam to leave the target.")] = "5s",
     by_slot: Annotated[
         bool,
-        typer.Option("--by-slot", help="Campaign: plan slot by slot instead of day by day."),
+        typer.Option(
+            "--by-slot", help="Campaign: plan one time slot at a time instead of one day at a time."
+        ),
     ] = False,
     worth: Annotated[
         float,
@@ -181,10 +188,12 @@ def check_outputs(outputs: tuple[Path | None, ...], field: Path, sightings: Path
     written: set[Path] = set()
     for file in (path for path in outputs if path is not None):
         if file.resolve() in written:
-            raise InputError(f"{file}: two outputs have this name; choose another for one of them")
+            raise InputError(
+                f"{file}: two outputs have this name; choose another name for one of them"
+            )
         written.add(file.resolve())
         if not file.parent.is_dir():
-            raise InputError(f"{file}: there is no folder {file.parent}; create it first")
+            raise InputError(f"{file}: the folder {file.parent} does not exist; create it first")
         inside = field.is_dir() and field.resolve() in file.resolve().parents and file.exists()
         if file.resolve() in read or inside:
             raise InputError(f"{file}: this file is an input; choose another name for the output")

@@ -15,7 +15,9 @@ def simulate(
     seed: Annotated[
         int,
         typer.Option(
-            min=0, max=2**63 - 1, help="Seed of all random numbers; the first one for --runs."
+            min=0,
+            max=2**63 - 1,
+            help="Seed of all random numbers; with --runs, the seed of the first run.",
         ),
     ] = 0,
     hours: Annotated[
@@ -33,7 +35,7 @@ def simulate(
         float, typer.Option(min=0.01, max=1e6, help="Mean time between faults, s.")
     ] = 12.0,
     only: Annotated[
-        list[str] | None, typer.Option(help="Only faults of this kind; may be repeated.")
+        list[str] | None, typer.Option(help="Inject only faults of this kind; may be repeated.")
     ] = None,
     world: Annotated[
         list[str] | None,
@@ -50,7 +52,8 @@ def simulate(
         typer.Option(min=0.001, max=1e6, help="Time after which no further run is started."),
     ] = None,
     progress: Annotated[
-        Path | None, typer.Option(help="File that records finished runs, from which to continue.")
+        Path | None,
+        typer.Option(help="File that records the finished runs; if it exists, continue from it."),
     ] = None,
     results: Annotated[
         Path | None,
@@ -59,7 +62,8 @@ def simulate(
     shrink: Annotated[
         bool,
         typer.Option(
-            help="Reduce the faults of a failed run to those that still reproduce the failure."
+            help="Reduce the faults of a failed run to a smaller set that still reproduces the "
+            "failure."
         ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,

@@ -25,11 +25,14 @@ def standby(
         typer.Option(
             min=1,
             max=1e6,
-            help="Largest light in the air, suns; default: only print today's light.",
+            help="Maximum irradiance in the air, suns; default: only print the irradiance with "
+            "the current standby points.",
             show_default=False,
         ),
     ] = None,
-    csv: Annotated[Path | None, typer.Option("--csv", help="File for the spread points.")] = None,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", help="File for the new, spread standby points.")
+    ] = None,
     picture: Annotated[
         Path | None, typer.Option(help="Picture to write (.png, .svg or .pdf).")
     ] = None,
@@ -76,7 +79,7 @@ def _check(plant: Path, csv: Path | None, picture: Path | None, limit: float | N
     from heliotrope.cli.plan import check_outputs
 
     if limit is None and (csv is not None or picture is not None):
-        raise InputError("standby: --csv and --picture are for spread points; set --limit-suns too")
+        raise InputError("standby: --csv and --picture need spread points; add --limit-suns")
     if picture is not None:
         check_picture(picture)
     check_outputs(tuple(path for path in (csv, picture) if path is not None), plant, None)
@@ -122,7 +125,7 @@ def _sun_text(sun: "FloatArray") -> str:
     import numpy as np
 
     azimuth = np.degrees(np.arctan2(sun[0], sun[1])) % 360.0
-    return f"{azimuth:.0f}°, {np.degrees(np.arcsin(sun[2])):.0f}° high"
+    return f"az {azimuth:.0f}°, el {np.degrees(np.arcsin(sun[2])):.0f}°"
 
 
 def glare(
@@ -130,7 +133,8 @@ def glare(
     at: Annotated[
         list[str] | None,
         typer.Option(
-            help="Place of an eye, as NAME=EAST,NORTH,UP in m; default: eyes_m of the plant file.",
+            help="Eye position of an observer, as NAME=EAST,NORTH,UP in m; default: eyes_m of "
+            "the plant file.",
             show_default=False,
         ),
     ] = None,
@@ -138,7 +142,7 @@ def glare(
         Path | None,
         typer.Option(help="Standby points (CSV); default: those of the plant file."),
     ] = None,
-    csv: Annotated[Path | None, typer.Option("--csv", help="File for the hours.")] = None,
+    csv: Annotated[Path | None, typer.Option("--csv", help="File for the hours of glare.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Print the hours of glare in a year at places of eyes, with the whole field at standby.
@@ -166,7 +170,7 @@ def glare(
     if as_json:
         print_json(documents)
         return
-    heads = ("eye", "low", "after-image", "damage", "suns at most", "with the sun at")
+    heads = ("eye", "low", "after-image", "damage", "peak suns", "with the sun at")
     rows = [
         (
             row["eye"],
@@ -188,10 +192,14 @@ def _eyes(design: "Plant", at: list[str] | None) -> "dict[str, FloatArray]":
     for text in at or ():
         name, sign, place = text.partition("=")
         if not (name and sign) or name in eyes:
-            raise InputError(f"--at {text!r}: write NAME=EAST,NORTH,UP, each name once")
+            raise InputError(
+                f"--at {text!r}: write NAME=EAST,NORTH,UP in m, and use each name only once"
+            )
         eyes[name] = np.array(parse_point(place, f"eye {name}"))
     if not eyes:
-        raise InputError(f"glare: {design.name} has no eyes_m; name places with --at NAME=E,N,U")
+        raise InputError(
+            f"glare: {design.name} has no eyes_m; add eye positions with --at NAME=EAST,NORTH,UP"
+        )
     return eyes
 
 

@@ -29,7 +29,7 @@ def sun(
     ] = 12.0,
     every: Annotated[
         str | None,
-        typer.Option(help="Print the whole day of TIME at this interval: 30s, 10min."),
+        typer.Option(help="Print the whole day of TIME at this interval, such as 30s or 10min."),
     ] = None,
     algorithm: Annotated[
         Literal["spa", "grena2008"],

@@ -21,9 +21,14 @@ def surface(
             "properties of each."
         ),
     ],
-    heliostat: Annotated[str, typer.Option(help="Heliostat whose beam they show.")],
+    heliostat: Annotated[str, typer.Option(help="Heliostat whose beam the pictures show.")],
     learn: Annotated[
-        int, typer.Option(min=1, max=64, help="Photographs to learn from; the others are a test.")
+        int,
+        typer.Option(
+            min=1,
+            max=64,
+            help="Number of photographs to learn from; the others are used as a test.",
+        ),
     ] = 8,
     out: Annotated[
         Path | None, typer.Option(help="Write the slope map here, .npz or .csv.")
@@ -76,16 +81,17 @@ def surface(
         "flat facets" if not np.isfinite(focal) else f"facets with a focal length of {focal:g} m"
     )
     print(
-        f"{heliostat}: slopes differ from {shape} by {document['slope_rms_mrad']:.2f} mrad RMS; "
-        f"slope error {document['slope_error_mrad']:.2f} mrad"
+        f"{heliostat}: slopes differ from those of {shape} by {document['slope_rms_mrad']:.2f} "
+        f"mrad RMS; slope error {document['slope_error_mrad']:.2f} mrad"
     )
     print(
-        f"learnt from {len(used)} photographs: accuracy {np.median(learnt.accuracy):.3f} (median)"
+        f"learned from {len(used)} photographs: accuracy {np.median(learnt.accuracy):.3f} (median)"
     )
     if tested:
         low = np.quantile(tested, 0.1)
         print(
-            f"{len(rest)} others: accuracy {np.median(tested):.3f} (median), 90 % above {low:.3f}"
+            f"tested on {len(rest)} others: accuracy {np.median(tested):.3f} (median), 90 % "
+            f"above {low:.3f}"
         )
     for line in result.left_out:
         print(f"left out: {line}")

@@ -63,7 +63,8 @@ def track(
         str | None, typer.Option(help="Sun vector east,north,up, instead of the one at TIME.")
     ] = None,
     every: Annotated[
-        str | None, typer.Option(help="Track the whole day of TIME at this interval: 30s, 10min.")
+        str | None,
+        typer.Option(help="Track the whole day of TIME at this interval, such as 30s or 10min."),
     ] = None,
     site: Annotated[
         str | None,
@@ -71,19 +72,27 @@ def track(
     ] = None,
     over_the_top: Annotated[
         bool,
-        typer.Option(help="With --every: go over the top wherever that saves slews or motion."),
+        typer.Option(
+            help="With --every: let the heliostat go over the top wherever that saves slews or "
+            "motion."
+        ),
     ] = False,
     calibration: Annotated[
-        Path | None, typer.Option(help="calibration.json from heliotrope calibrate, applied first.")
+        Path | None,
+        typer.Option(help="calibration.json from `heliotrope calibrate`, applied before tracking."),
     ] = None,
     law: Annotated[
         Literal["armature", "guo"],
-        typer.Option(help="armature: any mechanism; guo: the closed form for azimuth-elevation."),
+        typer.Option(
+            help="Tracking law: armature works for any mechanism; guo is the closed form for "
+            "azimuth-elevation."
+        ),
     ] = "armature",
     local: Annotated[
         bool,
         typer.Option(
-            help="The aim is fixed to the mirror: a point in the heliostat frame at zero angles."
+            help="The aim point moves with the mirror; it is given in the heliostat frame at "
+            "zero angles."
         ),
     ] = False,
     trace: Annotated[
@@ -167,7 +176,10 @@ def _opened(field: Path, place: str, calibration: Path | None) -> "Plant":
 def _check(every: str | None, law: str, local: bool, trace: bool, target: str | None) -> None:
     """Refuse options that exclude each other."""
     if local and target is not None:
-        raise InputError("--target is not fixed to a mirror; use --aim, or leave out --local")
+        raise InputError(
+            "--local needs an aim point that moves with the mirror, and a target does not; use "
+            "--aim instead of --target, or leave out --local"
+        )
     if law == "guo" and (every is not None or local or trace):
         raise InputError(
             "--law guo prints a single time and aims in ENU only; leave out --every, --local and "
@@ -175,7 +187,7 @@ def _check(every: str | None, law: str, local: bool, trace: bool, target: str | 
         )
     if trace and (every is not None or local):
         raise InputError(
-            "--trace prints a single time and aims in ENU only; leave out --every, --local"
+            "--trace prints a single time and aims in ENU only; leave out --every and --local"
         )
 
 
@@ -251,8 +263,8 @@ def check_front(plant: "Plant", heliostat: str, aim: Any, vertices: "np.ndarray"
         beyond = float((aim - surface.center) @ surface.normal)
         if surface.holds(aim, _ON) and (ahead <= 0.0).any():
             raise InputError(
-                f"heliostat {heliostat} is {-ahead.min():.2f} m behind {surface.name}, so its beam "
-                "would reach the back; choose another target or aim"
+                f"heliostat {heliostat} is {-ahead.min():.2f} m behind {surface.name}, so its "
+                "beam would hit the back of the surface; choose another target or aim"
             )
         # An aperture may be crossed: the aim is inside a cavity.
         crossed = ahead * beyond < 0.0
@@ -261,7 +273,7 @@ def check_front(plant: "Plant", heliostat: str, aim: Any, vertices: "np.ndarray"
         share = ahead[crossed] / (ahead[crossed] - beyond)
         if surface.holds(at[crossed] + share[:, None] * (aim - at[crossed])).any():
             raise InputError(
-                f"heliostat {heliostat}: {surface.name} stands between it and the aim; choose "
+                f"heliostat {heliostat}: {surface.name} is between it and the aim point; choose "
                 "another aim"
             )
 
@@ -335,7 +347,7 @@ def _print_branches(document: dict[str, Any], heliostat: str) -> None:
         )
     when = "" if document["sun_from"] != "time" else f" at {document['time'].isoformat()}"
     whose = "the file's sun" if document["sun_from"] == "file" else "sun"
-    print(f"{heliostat}{when}, {whose} at {document['sun_elevation_deg']:.2f}° of elevation")
+    print(f"{heliostat}{when}, {whose} at {document['sun_elevation_deg']:.2f}° elevation")
     names = "joints " + " and ".join(document["joints"])
     print_table(["branch", "azimuth", "elevation", names, "counts", "residual", ""], rows)
     served = document["branches"][document["best"]]["reachable"]

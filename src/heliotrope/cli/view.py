@@ -29,8 +29,10 @@ def view(
     heliostat: HeliostatOption,
     aim: AimOption = None,
     target: TargetOption = None,
-    time: Annotated[str, typer.Option(help="A time of day, ISO 8601 with a zone.")] = "now",
-    every: Annotated[str, typer.Option(help="Time between poses: 5min, 30s.")] = "10min",
+    time: Annotated[
+        str, typer.Option(help="A time on the day to show, ISO 8601 with a zone.")
+    ] = "now",
+    every: Annotated[str, typer.Option(help="Time between poses, such as 5min or 30s.")] = "10min",
 ) -> None:
     """Write a day of a heliostat's motion as an animated 3D view."""
     import numpy as np

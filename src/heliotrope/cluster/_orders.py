@@ -184,7 +184,7 @@ class Orders:
         authority = self._authority()
         if authority == 0:
             raise OrderRefusedError(
-                "nobody has command authority because the plant's lease has expired"
+                "nobody has the command authority because the plant's lease has expired"
             )
         if token != authority:
             raise OrderRefusedError(

@@ -144,7 +144,7 @@ class SafetyTable(Table):
         "", description="GPIO file whose first byte is 1 while current flows in the emergency line."
     )
     bus_errors: dict[str, float] = Field(
-        default_factory=dict, description="Numbers of this safety condition, as in the plant file."
+        default_factory=dict, description="Settings of this safety condition, as in the plant file."
     )
     bus_failed: dict[str, float] = Field(default_factory=dict, description="The same.")
     clock_jump: dict[str, float] = Field(default_factory=dict, description="The same.")

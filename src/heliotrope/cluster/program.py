@@ -95,7 +95,9 @@ class LocalCluster:
         if listed != set(members):
             odd = min(listed ^ set(members))
             where = "the plant file" if odd in members else "this file"
-            raise FormatError(path, f"{odd} is a heliostat of {name} in {where} only", "heliostats")
+            raise FormatError(
+                path, f"{odd} is listed as a heliostat of {name} only in {where}", "heliostats"
+            )
         near, far, _ = memory_pair(clock, names=("plant", name))
         bus = SerialBus(installation.bus_url, clock, installation.bus)
         time = time_of(installation, clock)

@@ -269,10 +269,14 @@ class SystemTime:
             return (
                 math.inf,
                 "none",
-                (f"the computer's clock shows {utc:%Y-%m-%d}, so it was never set"),
+                f"the computer's clock shows {utc:%Y-%m-%d}, so it was never set",
             )
         if error == math.inf:
-            return math.inf, "none", "the computer's clock is not disciplined; is chronyd running?"
+            return (
+                math.inf,
+                "none",
+                "the computer's clock is not disciplined; check that chronyd is running",
+            )
         if error > LARGEST_ERROR:
             return math.inf, "none", _old(error, f", more than {LARGEST_ERROR:g} s")
         ahead = None if self._gpsd is None else self._gpsd.ahead
@@ -286,7 +290,11 @@ class SystemTime:
         if self._bound is not None and now - self._bound.renewed_at > _FRESH:
             return error, "holdover", _old(error, "")
         if self._bound is not None and not self._bound.kept:
-            return error, "holdover", "the computer's clock is not disciplined; is chronyd running?"
+            return (
+                error,
+                "holdover",
+                "the computer's clock is not disciplined; check that chronyd is running",
+            )
         problem = "" if self._gpsd is None else self._gpsd.problem
         return error, "system" if ahead is None else "gps", problem
 

@@ -46,15 +46,15 @@ def weakness(password: str, name: str = "") -> str | None:
     if len(set(small)) < _DIFFERENT:
         return f"it has fewer than {_DIFFERENT} different characters"
     if _repeated(small):
-        return "it repeats a part"
+        return "it repeats the same part"
     if _running(small) > _RUNNING * len(small):
         return "it follows the keyboard or the alphabet"
     read = {_bare(small), _bare(small.translate(_LETTERS)), _bare(small).translate(_LETTERS)}
     if any(_is_common(word) for word in read):
-        return "it is a common password, or varies one"
+        return "it is a common password, or a variation of one"
     own = name.casefold()
     if len(own) > 2 and own in small and len(small) - len(own) < 8:
-        return "it is the name of the account with little beside it"
+        return "it is little more than the name of the account"
     return None
 
 

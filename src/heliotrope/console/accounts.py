@@ -238,7 +238,7 @@ async def _find(console: Console, name: str, *, password: bool) -> None:
     if account is None:
         raise HTTPException(404, f"there is no account {name}")
     if password and account.by_proxy:
-        raise HTTPException(409, f"{name} signs in by the proxy, and has no password here")
+        raise HTTPException(409, f"{name} signs in through the proxy and has no password here")
 
 
 async def _without_password(console: Console, who: Caller) -> bool:

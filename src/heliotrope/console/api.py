@@ -123,7 +123,9 @@ async def command(
     settle(who, request)
     if name not in OPERATOR_COMMANDS and who.person.role < Role.ENGINEER:
         await refused(console, request, who)
-        raise HTTPException(403, f"{name}: {who.person.name} is operator; this needs engineer")
+        raise HTTPException(
+            403, f"{name}: {who.person.name} has the role operator; this needs engineer"
+        )
     return answer(await console.plant.ask("command", who.person, **order.model_dump()))
 
 
@@ -137,7 +139,7 @@ def _endpoint(name: str, call: Call) -> Callable[..., Any]:
         if call.pack is not None:
             arguments, blob = call.pack(order)
             if len(blob) > REQUEST_BLOB:
-                raise HTTPException(413, f"it is longer than {REQUEST_BLOB >> 20} MiB; divide it")
+                raise HTTPException(413, f"it is longer than {REQUEST_BLOB >> 20} MiB; split it")
         if call.fresh and call.answer is not WithBlob:
             return await shared(console, request, name, call.fresh, **parameters)
         value, data = await console.plant.fetch(name, who.person, blob, **arguments, **parameters)

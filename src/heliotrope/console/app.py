@@ -41,8 +41,8 @@ from heliotrope.store.records import StoreError
 
 ABOUT = (
     "Reads and commands a heliostat field. Sign in (POST /api/v1/session) or send a token "
-    "(Authorization: Bearer). In a session, every change needs the header X-CSRF-Token with the "
-    "word that the answer to the sign-in gave."
+    "(Authorization: Bearer). In a session, every change needs the header X-CSRF-Token with "
+    "the value from the reply to the sign-in."
 )
 
 ROUTERS = (api.router, accounts.router, factor.router)

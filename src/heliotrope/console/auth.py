@@ -361,7 +361,7 @@ def settle(who: Caller, connection: HTTPConnection) -> None:
         raise HTTPException(
             423,
             "no order was sent from here for a while, so enter your password again; EMERGENCY, "
-            "DEFOCUS and STOW are accepted all the same",
+            "DEFOCUS and STOW are still accepted",
         )
     if who.owes:
         text, requests = DUES[who.owes]
@@ -369,7 +369,7 @@ def settle(who: Caller, connection: HTTPConnection) -> None:
             raise HTTPException(
                 403,
                 f"{text}: on the page /account, or by `heliotrope ctl {who.owes}`; EMERGENCY, "
-                "DEFOCUS and STOW are accepted all the same",
+                "DEFOCUS and STOW are still accepted",
             )
 
 
@@ -407,7 +407,9 @@ class AtLeast:
         """Return a caller whose role is high enough; see `__call__`."""
         if who.person.role < self.role:
             name, mine = who.person.name, who.person.role.name.lower()
-            raise HTTPException(403, f"{name} is {mine}; this needs {self.role.name.lower()}")
+            raise HTTPException(
+                403, f"{name} has the role {mine}; this needs {self.role.name.lower()}"
+            )
         return who
 
 

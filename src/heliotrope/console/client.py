@@ -79,7 +79,8 @@ class Client:
             ) from None
         except httpx.HTTPError as error:
             raise RemoteError(
-                f"console {self._url}: {str(error) or type(error).__name__}; is it running there?"
+                f"console {self._url}: {str(error) or type(error).__name__}; check that it is "
+                "running there"
             ) from None
         if answer.is_success:
             return answer
@@ -138,7 +139,7 @@ def _detail(answer: httpx.Response) -> str:
     try:
         detail = answer.json()["detail"]
     except (ValueError, KeyError, TypeError):
-        return f"the console answers {answer.status_code}"
+        return f"the console replied with status {answer.status_code}"
     if isinstance(detail, str):
         return detail
     return "; ".join(

@@ -74,7 +74,7 @@ class Edge:
         key = who.person.name
         if len(self._large) >= MOST_LARGE or self._large.count(key) >= OWN_LARGE:
             raise HTTPException(
-                429, "another large request is at work; try again", {"Retry-After": "1"}
+                429, "another large request is being processed; try again", {"Retry-After": "1"}
             )
         self._large.append(key)
         try:

@@ -71,7 +71,7 @@ async def remove_factor(
     if not who.factor:
         raise HTTPException(409, f"{who.person.name}: set up your own second factor first")
     if name == who.person.name:
-        raise HTTPException(409, f"{name}: remove your own one with DELETE session/factor")
+        raise HTTPException(409, f"{name}: remove your own with DELETE session/factor")
     await confirm(console, who, request, body.own_password, body.own_code)
     if await console.ask(lambda: console.people.account(name)) is None:
         raise HTTPException(404, f"there is no account {name}")

@@ -134,7 +134,9 @@ class Guard:
                 raise HTTPException(401, "sign in, or send a valid token")
             raise HTTPException(404, "nothing is at this address")
         if route.status == 405:
-            raise HTTPException(405, "not this method", {"Allow": ", ".join(route.allow)})
+            raise HTTPException(
+                405, "this method is not allowed here", {"Allow": ", ".join(route.allow)}
+            )
         raise HTTPException(404, "nothing is at this address")
 
     def _dress(self, console: Console, scope: Scope, headers: Any) -> None:

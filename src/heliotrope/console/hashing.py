@@ -92,7 +92,7 @@ class Hashing:
                 if not other.turn.done():
                     other.turn.set_exception(_left(other))
             if self._full(place):
-                raise CrowdError("too many people sign in at once")
+                raise CrowdError("too many people are signing in at once")
         self._waiting.append(place)
         try:
             await place.turn

@@ -89,7 +89,10 @@ class CallerState(BaseModel):
         0.0, description="Time after which a command needs the password again; 0: never"
     )
     sign_ins_per_hour: int = Field(
-        0, description="Failed sign-ins of one name at one address, after which it must wait"
+        0,
+        description=(
+            "Failed sign-ins for one name from one address after which further attempts must wait"
+        ),
     )
 
 

@@ -18,7 +18,7 @@ from heliotrope.plant.operations.security import SecurityEvent
 from heliotrope.store.people import BY_PROXY, Account
 
 _BY_LINK = "by the one-time link"
-_WRONG_CODE = "the code is wrong or was used already; wait for the next one"
+_WRONG_CODE = "the code is wrong or has already been used; wait for the next one"
 
 
 async def log_in(
@@ -214,14 +214,14 @@ async def confirm(
     if who.no_password:
         raise HTTPException(
             403,
-            f"{who.person.name} has no password yet, which this needs once more; set one on the "
-            "page /account",
+            f"this needs your password again, but {who.person.name} has none yet; set one on "
+            "the page /account",
         )
     if who.by_proxy:
         raise HTTPException(
             403,
-            f"{who.person.name} has no password here, which this needs once more; ask an engineer "
-            "whose account has one",
+            f"this needs your password again, but {who.person.name} has none here; ask an "
+            "engineer whose account has one",
         )
     try:
         event = SecurityEvent.CONFIRMATION_FAILED

@@ -79,7 +79,7 @@ class AimSettings:
             "clock_s": (self.clock, 0.0, 600.0, " s"),
             "cluster_mrad": (1e3 * self.cluster, 0.0, 50.0, " mrad"),
             "dni_w_m2": (self.dni, 1.0, 1500.0, " W/m²"),
-            "ramp_kw_m2_min": (0.06 * self.ramp, 0.0, 64000.0, " kW/m² a minute"),
+            "ramp_kw_m2_min": (0.06 * self.ramp, 0.0, 64000.0, " kW/m² per minute"),
             "moves_per_minute": (self.moves, 1.0, 6000.0, ""),
             "together": (self.together, 1, 1000, ""),
             "every_s": (self.every, 5.0, 600.0, " s"),

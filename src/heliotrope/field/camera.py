@@ -124,8 +124,8 @@ def checked_pinhole(
     width, height = (int(n) for n in camera.size)
     if not (smallest <= width <= 100_000 and smallest <= height <= 100_000):
         raise InputError(
-            f"{name}: frames must measure {smallest} to 100000 px each way, not {width} × {height} "
-            "px"
+            f"{name}: frames must measure {smallest} to 100000 px in each direction, not {width} "
+            f"× {height} px"
         )
     matrix = as_float(camera.matrix)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():

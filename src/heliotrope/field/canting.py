@@ -109,8 +109,9 @@ def _aims(plant: Plant, name: str, group: Heliostats) -> FloatArray:
     if missing.any():
         k = int(np.flatnonzero(missing)[0])
         raise InputError(
-            f"groups.{name}.mirror: heliostat {group.names[k]} has no aim to be canted for; add a "
-            "receiver, columns aim_east_m, aim_north_m and aim_up_m, or canting_focal_m"
+            f"groups.{name}.mirror: heliostat {group.names[k]} has no aim point to cant its "
+            "facets for; add a receiver, columns aim_east_m, aim_north_m and aim_up_m, or "
+            "canting_focal_m"
         )
     return own
 

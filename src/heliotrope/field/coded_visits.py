@@ -86,14 +86,14 @@ class CodedSettings:
     )
     visit: float = _number(
         0.5,
-        "part of this error that changes at random from visit to visit, each axis",
+        "part of this error that changes at random from visit to visit, per axis",
         0,
         unit="mrad",
     )
     movement: float
     settle: float = _number(
         1.0,
-        "from the moment all heliostats have reached their aims until the photograph",
+        "time from the arrival of the last heliostat to the photograph",
         0,
         60,
         "s",
@@ -128,14 +128,26 @@ class JointSettings(CodedSettings):
 
     kind: ClassVar[str] = "joint visits"
 
-    most: int = _number(49, "heliostats on one target at once", 2, 127)
-    least: int = _number(4, "heliostats that a visit of automatic control needs", 2, 127)
+    most: int = _number(49, "maximum number of heliostats on one target at once", 2, 127)
+    least: int = _number(4, "minimum number of heliostats for a visit by automatic control", 2, 127)
     movement: float = _number(
-        0.5, "coded movement of a beam, either way along each axis", 0, 5, "mrad", above=True
+        0.5,
+        "coded movement of a beam, in both directions along each axis",
+        0,
+        5,
+        "mrad",
+        above=True,
     )
-    again: float = _number(2.5, "photographs at most, beyond the number that a visit needs", 1)
-    brightest: float = _number(10.0, "most light on a target", 0, unit="suns", above=True)
-    first: int = _number(15, "heliostats without a calibration at once; 0: each on its own", 0, 127)
+    again: float = _number(
+        2.5, "maximum number of photographs, as a multiple of the number that a visit needs", 1
+    )
+    brightest: float = _number(10.0, "maximum irradiance on a target", 0, unit="suns", above=True)
+    first: int = _number(
+        15,
+        "maximum number of heliostats without a calibration at once; 0: measure each separately",
+        0,
+        127,
+    )
     first_movement: float = _number(
         2.0, "coded movement of their beams, to the right and to the left", 0, 5, "mrad", above=True
     )
@@ -165,8 +177,8 @@ class ReceiverSettings(CodedSettings):
 
     camera: str = field(kw_only=False)
     receiver: str = field(kw_only=False)
-    most: int = _number(50, "heliostats at once", 1, 127)
-    least: int = _number(8, "heliostats that a visit of automatic control needs", 1, 127)
+    most: int = _number(50, "maximum number of heliostats at once", 1, 127)
+    least: int = _number(8, "minimum number of heliostats for a visit by automatic control", 1, 127)
     known: float = _number(
         4.0,
         "largest expected beam error of a participating heliostat, RMS",
@@ -176,20 +188,27 @@ class ReceiverSettings(CodedSettings):
         above=True,
     )
     movement: float = _number(
-        1.0, "coded movement of a beam, either way along each axis", 0, 2, "mrad", above=True
+        1.0,
+        "coded movement of a beam, in both directions along each axis",
+        0,
+        2,
+        "mrad",
+        above=True,
     )
-    again: float = _number(1.5, "photographs at most, beyond the number that a visit needs", 1, 10)
+    again: float = _number(
+        1.5, "maximum number of photographs, as a multiple of the number that a visit needs", 1, 10
+    )
     exposures: int = _number(1, "frames that are averaged for a photograph", 1, 100)
     power: float = _number(
-        0.005, "largest fraction of the power that the movements cost", 0, 0.01, above=True
+        0.005, "largest fraction of the power that the movements may cost", 0, 0.01, above=True
     )
     steady: float = _number(
-        0.05, "largest change of the light between photographs, as a share", 0, 0.5, above=True
+        0.05, "largest relative change of the light between photographs", 0, 0.5, above=True
     )
     worth: float = _number(
         0.3,
-        "smallest change of a beam for which its heliostat is moved off the receiver",
+        "smallest correction of a beam for which its heliostat leaves the receiver",
         0,
         unit="mrad",
     )
-    every: float = _number(7200.0, "least time between two visits of a heliostat", 0, unit="s")
+    every: float = _number(7200.0, "shortest time between two visits of a heliostat", 0, unit="s")

@@ -134,11 +134,11 @@ def _aim(heliostat: Steered, aim: str | Target | Receiver | npt.ArrayLike | None
     if aim is not None:
         return point_of(aim, targets)
     if not targets and not isinstance(heliostat, Heliostat):
-        raise InputError("aim: there is no target; pass a point (east, north, up) in m")
+        raise InputError("aim: the plant has no target; pass a point (east, north, up) in m")
     first = targets[0].center if targets else None
     own = _own_aims(heliostat)
     if first is None and not all(point is not None for point in own):
-        raise InputError("aim: there is no target; pass a point (east, north, up) in m")
+        raise InputError("aim: the plant has no target; pass a point (east, north, up) in m")
     if all(point is None for point in own):
         return np.asarray(first)
     aims = np.array([first if point is None else point for point in own])

@@ -110,7 +110,7 @@ class Panel:
         if not 0.0 <= self.begin < self.end <= 1.0:
             raise InputError(
                 f"panel of path {self.path}: from {self.begin:g} to {self.end:g} of the width; "
-                "the edges must ascend and lie from 0 to 1"
+                "the edges must increase and lie between 0 and 1"
             )
 
 

@@ -211,7 +211,7 @@ class Heliostats(Value, Framed):
             raise InputError(
                 f"heliostat {self.names[i]}: facet {k} reaches {right:.3f} m to a side and "
                 f"{up:.3f} m up or down from the middle, but the mirror is {self.width[i]:.3f} × "
-                f"{self.height[i]:.3f} m; correct either"
+                f"{self.height[i]:.3f} m; correct one of them"
             )
 
     def _card(self) -> Card:

@@ -39,19 +39,19 @@ class TriangleMesh:
             )
         if len(faces) > MOST_FACES:
             raise InputError(
-                f"mesh: {len(faces):,} triangles; use at most {MOST_FACES:,}, about as large as "
-                "the beam of a mirror is wide"
+                f"mesh: {len(faces):,} triangles; use at most {MOST_FACES:,}; they need not be "
+                "smaller than a mirror's beam"
             )
         if faces.min() < 0 or faces.max() >= len(vertices):
             raise InputError(
-                f"mesh: a face has vertex {faces.max()}, but there are only {len(vertices)}"
+                f"mesh: a face uses vertex {faces.max()}, but there are only {len(vertices)}"
             )
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces.astype(np.int64))
         small = ~(np.linalg.norm(self._cross, axis=-1) > 2.0 * _LEAST_AREA)
         if small.any():
             k = int(np.flatnonzero(small)[0])
-            raise InputError(f"mesh: triangle {k} has no area; leave it out")
+            raise InputError(f"mesh: triangle {k} has no area; remove it")
 
     @property
     def _cross(self) -> FloatArray:

@@ -89,7 +89,8 @@ class FacetGrid:
         counts = np.array([self.columns, self.rows])
         if not ((counts >= 1) & (counts <= 50)).all():
             raise InputError(
-                f"mirrors must have 1 to 50 facets each way, not {self.columns} × {self.rows}"
+                f"mirrors must have 1 to 50 facets in each direction, not {self.columns} × "
+                f"{self.rows}"
             )
         size = np.stack([width, height], axis=-1)
         whole = (size - self.gap * (counts - 1)) / counts

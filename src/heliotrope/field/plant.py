@@ -111,14 +111,14 @@ class Plant(Value, Framed):
             _ = self.camera(self.receiver_visits.camera).pose
         if self.aims.limit is not None and len(self.receivers) != 1:
             raise InputError(
-                f'aims: strategy "limit" needs one receiver, and the plant has '
-                f"{len(self.receivers)}; leave [aims] out, and choose aims with heliotrope aim "
-                "for one receiver at a time"
+                'aims: strategy "limit" needs one receiver, and the plant has '
+                f"{len(self.receivers)}; remove [aims], and choose aims for one receiver at a time "
+                "with heliotrope aim"
             )
         if self.aims.limit is not None and self.receivers[0].mesh is not None:
             raise InputError(
                 f'aims: strategy "limit" needs a planar or cylindrical receiver, and '
-                f"{self.receivers[0].name} is a {self.receivers[0].kind}; leave [aims] out"
+                f"{self.receivers[0].name} is a {self.receivers[0].kind}; remove [aims]"
             )
         self.check_towers(self.towers)
         if self.timetable:
@@ -133,8 +133,8 @@ class Plant(Value, Framed):
             if inside.any():
                 k = int(np.flatnonzero(inside)[0])
                 raise InputError(
-                    f"heliostat {self.names[k]} stands {away[k]:.2f} m from the axis of a tower "
-                    f"of radius {tower.radius:g} m, inside it; correct either"
+                    f"heliostat {self.names[k]} is {away[k]:.2f} m from the axis of a tower "
+                    f"of radius {tower.radius:g} m, inside it; correct one of them"
                 )
 
     def _check_places(self) -> None:
@@ -299,7 +299,7 @@ class Plant(Value, Framed):
             group, _ = self._place[name]
             raise InputError(
                 f"group {group}: the plant file has no table [groups.{group}.machine]; add it "
-                "(rates, limits, backlash, defocus, stow), as docs/reference/plant-format.md says"
+                "(rates, limits, backlash, defocus, stow); see docs/reference/plant-format.md"
             )
         return heliostats.machines[row]
 

@@ -184,7 +184,7 @@ class Rows:
     def within(self, column: str, values: FloatArray, low: float, high: float, unit: str) -> None:
         """Leave out the rows whose value is outside ``low`` to ``high``, in ``unit``."""
         outside = ~((values >= low) & (values <= high)) & np.isfinite(values)
-        limits = f" is outside {low:g} to {high:g} {unit}; is it in another unit?"
+        limits = f" is outside {low:g} to {high:g} {unit}; check the unit"
         self.check(column, outside, values, limits)
 
     def names(self, column: str, what: str) -> tuple[str, ...]:

@@ -75,7 +75,7 @@ class JsonNode:
     def text(self) -> str:
         """Return a string."""
         if not isinstance(self.value, str):
-            raise self.fail(f"expected a text, found {self.value!r:.60}")
+            raise self.fail(f"expected text, found {self.value!r:.60}")
         return self.value
 
     def vector(self) -> tuple[float, float, float]:

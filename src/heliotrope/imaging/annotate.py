@@ -140,7 +140,7 @@ class _Sheet:
             colour = GOOD if reading.good else BAD
             lines += [(line, colour) for line in _said(reading)]
         if photograph.beside:
-            lines.append((f"beside the targets: {len(photograph.beside)} spots", OTHER))
+            lines.append((f"outside the targets: {len(photograph.beside)} spots", OTHER))
         scale, pitch = 0.5, 20
         width = self.picture.shape[1]
         most = max(width // 9, 20)

@@ -216,8 +216,8 @@ def _content(file: Path, limit: int) -> tuple[bytes, float]:
         if state.st_size > most:
             raise FormatError(
                 file,
-                f"{state.st_size / 2**20:.0f} MiB are more than {limit / 1e6:.3g} million "
-                "pixels can have; check that it is an image, or raise the limit",
+                f"{state.st_size / 2**20:.0f} MiB are more than an image of {limit / 1e6:.3g} "
+                "million pixels can take; check that it is an image, or raise the limit",
             )
         data = read_bytes(file, most)
     except FileNotFoundError:
@@ -287,9 +287,7 @@ def _damaged(file: Path, kind: str, size: int, error: Exception) -> FormatError:
 
 def _check_size(file: Path, width: int, height: int, limit: int) -> None:
     if width < SMALLEST or height < SMALLEST:
-        text = (
-            f"{width} × {height} px; an image must have at least {SMALLEST} × {SMALLEST} px or more"
-        )
+        text = f"{width} × {height} px; an image must have at least {SMALLEST} × {SMALLEST} px"
         raise FormatError(file, text)
     if width * height > limit:
         text = f"{width} × {height} px are {width * height / 1e6:.3g} million, above the limit of "

@@ -152,7 +152,7 @@ def calibrate_chessboard(
     columns, rows = (int(n) for n in pattern)
     if min(columns, rows) < 3 or max(columns, rows) > 200:
         what = f"chessboard of {columns} × {rows} inner corners"
-        raise InputError(f"{what}; use 3 to 200 each, counted between the squares")
+        raise InputError(f"{what}; use 3 to 200 each, counting only corners inside the board")
     pictures = [_eight_bit(image) for image in images]
     called = list(names) or [f"picture {k + 1}" for k in range(len(pictures))]
     if len(pictures) < 3:

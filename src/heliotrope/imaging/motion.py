@@ -397,14 +397,20 @@ def _compare(
         return FrameMotion(problem=problem)
     expected, ratio = _expected(first, second)
     if not 1.0 / settings.max_ratio <= ratio <= settings.max_ratio:
-        text = f"the brightness changed by {ratio:.3g}, the limit is {settings.max_ratio:g}"
+        text = (
+            f"the brightness changed by a factor of {ratio:.3g}; the limit is "
+            f"{settings.max_ratio:g}"
+        )
         return FrameMotion(brightness_ratio=ratio, problem=text)
     believed = _register(expected, second.image)
     reduced = believed or (0.0, 0.0)
     edge = max(_MOST_EDGE, 0.0 if believed else _UNSURE / first.factor)
     shift = (reduced[0] * first.factor, reduced[1] * first.factor)
     if math.hypot(*shift) > settings.max_shift_px:
-        text = f"the camera moved by {math.hypot(*shift):.1f} of {settings.max_shift_px:g} px"
+        text = (
+            f"the camera moved by {math.hypot(*shift):.1f} px; the limit is "
+            f"{settings.max_shift_px:g} px"
+        )
         return FrameMotion(shift_px=shift, brightness_ratio=ratio, problem=text)
     parts = _difference(first, second, expected, reduced, ratio)
     counts = np.ones(expected.shape, np.uint8) if mask is None else mask
@@ -436,7 +442,10 @@ def _compare(
 def _exposed(view: _View, which: str) -> str:
     most, full = float(view.cells.max()), float((view.cells >= _SATURATED).mean())
     if most < 4.0 * view.step:
-        return f"the {which} frame is dark: at most {most / view.step:.1f} digits"
+        return (
+            f"the {which} frame is dark: its brightest pixel has {most / view.step:.1f} digital "
+            "counts"
+        )
     if full > 0.5:
         return f"the {which} frame is overexposed: {100 * full:.0f} % of it is saturated"
     return ""

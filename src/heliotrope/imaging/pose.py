@@ -380,12 +380,14 @@ def _plane_sigma(problem: _Problem, x: FloatArray, raw: FloatArray) -> float:
 
 def _notes(problem: _Problem, fit: CameraFit, scale: float) -> list[str]:
     notes = []
-    good = f"pixels on the plane of the points remain good to {1e3 * fit.plane_sigma:.1f} mm"
+    good = f"pixels on the plane of the points remain accurate to {1e3 * fit.plane_sigma:.1f} mm"
     if problem.free and fit.sigma("log_focal") > 0.05:
         away = np.linalg.norm(np.asarray(fit.camera.position) - problem.origin)
         have = f"{fit.camera.matrix[0, 0]:.0f} px at {away:.1f} m"
         unsure = f"uncertain by a factor of {np.exp(fit.sigma('log_focal')):.2f}"
-        notes.append(f"focal length and distance are not separable: {have}, {unsure}; {good}")
+        notes.append(
+            f"focal length and distance cannot be determined separately: {have}, {unsure}; {good}"
+        )
     if problem.free:
         sigma = problem.prior[1]
         what = (

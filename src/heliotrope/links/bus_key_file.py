@@ -119,7 +119,7 @@ class BusKeyFile:
         """
         if len(self.keys) < _MOST:
             raise InputError(
-                f"{self.path}: it has no old key beside a new one; there is nothing to end"
+                f"{self.path}: it has no old key that a new one replaces; there is nothing to end"
             )
         self._write(self.keys[0])
 

@@ -283,7 +283,8 @@ class KeyFile:
             if len(links.get(name, ())) < _MOST:
                 who = f"{name} has" if name else "nobody has"
                 raise InputError(
-                    f"{self.path}: {who} an old key beside a new one; there is nothing to end"
+                    f"{self.path}: {who} an old key that a new one replaces; there is nothing "
+                    "to end"
                 )
         self._write({name: links[name][:1] for name in chosen})
         return chosen

@@ -215,7 +215,7 @@ class _MqttCarrier:
                 self._ends.out, envelope, qos=int(confirmed), retain=False, properties=properties
             )
         except aiomqtt.MqttError as error:
-            raise LinkLostError(f"the broker did not take a message ({error})") from None
+            raise LinkLostError(f"the broker did not accept a message ({error})") from None
         if confirmed:
             self._unconfirmed = 0
 
@@ -225,7 +225,7 @@ class _MqttCarrier:
             try:
                 message = await anext(aiter(self._connected().messages))
             except aiomqtt.MqttError as error:
-                raise LinkLostError(f"the connection to the broker is gone ({error})") from None
+                raise LinkLostError(f"the connection to the broker was lost ({error})") from None
             if message.retain:
                 self._statistics.retained += 1
             elif len(message.payload) > self._longest:

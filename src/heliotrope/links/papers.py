@@ -91,11 +91,11 @@ class _Certificate:
         """Return the certificate's expiry in words."""
         days = self.days(now)
         if days is None or self.end is None:
-            return f"the end of certificate {self.path} is unknown ({self.problem})"
+            return f"the expiry date of certificate {self.path} is unknown ({self.problem})"
         day = f"{self.end:%Y-%m-%d %H:%M} UTC"
         if days < 0:
-            return f"certificate {self.path} ended on {day}"
-        return f"certificate {self.path} ends on {day}, in {days} days"
+            return f"certificate {self.path} expired on {day}"
+        return f"certificate {self.path} expires on {day}, in {days} days"
 
 
 class Papers:

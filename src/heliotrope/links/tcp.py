@@ -213,7 +213,10 @@ async def _introduce(pipe: _Pipe, name: str, key: bytes, ring: KeyRing) -> SealK
             f"the server refuses cluster {name} ({lost}); compare name and key on both sides"
         ) from None
     if not hmac.compare_digest(answer, _proof(key, b"server", server, client, title)):
-        raise LinkError(f"the server does not know the key of cluster {name}; it is not ours")
+        raise LinkError(
+            f"the server could not prove that it knows the key of cluster {name}; check that "
+            "the address is that of this plant"
+        )
     return _derived(ring, server, client, title)
 
 
@@ -495,8 +498,8 @@ class TcpServer:
             )
         except OSError as error:
             raise LinkError(
-                f"cannot listen on {self._host}:{self._requested} ({error.strerror or error}); is "
-                "another plant running there?"
+                f"cannot listen on {self._host}:{self._requested} ({error.strerror or error}); "
+                "check whether another plant is running there"
             ) from None
         self.port = server.sockets[0].getsockname()[1]
         self._listening.set()

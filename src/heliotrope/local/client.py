@@ -111,7 +111,7 @@ class LocalConnection:
             raise
 
     def _away(self, why: str) -> AwayError:
-        return AwayError(f"the plant's process does not answer ({why}); see whether it runs")
+        return AwayError(f"the plant's process does not answer ({why}); check that it is running")
 
     @property
     def up(self) -> bool:
@@ -209,8 +209,8 @@ def fetch_once(
     except (OSError, EOFError, FrameError) as error:
         why = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise AwayError(
-            f"the plant at {path} does not answer ({why}); is it running, and is this its own user "
-            "or root?"
+            f"the plant at {path} does not answer ({why}); check that it is running, and that "
+            "you are its user or root"
         ) from None
 
 

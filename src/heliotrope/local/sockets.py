@@ -89,7 +89,7 @@ def listen(path: Path) -> socket.socket:
         made.setblocking(False)
     except OSError as error:
         made.close()
-        raise InputError(f"{path}: it cannot listen there: {error.strerror}") from None
+        raise InputError(f"{path}: cannot listen on this socket: {error.strerror}") from None
     return made
 
 
@@ -115,7 +115,7 @@ def connect(path: Path, timeout: float) -> socket.socket:
                         raise
                     time.sleep(_AGAIN)
         if os.getuid() and user_of(made) is None:
-            raise PermissionError(errno.EACCES, "another user listens there")
+            raise PermissionError(errno.EACCES, "another user is listening on it")
     except BaseException:
         made.close()
         raise

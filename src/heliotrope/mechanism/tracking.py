@@ -70,9 +70,11 @@ _TEXTS = {
     TrackingStatus.OK: "the beam reaches its aim",
     TrackingStatus.UNREACHABLE: "the axes cannot turn the mirror there; this is the nearest pose",
     TrackingStatus.STOPPED: "a stop is in the way; this is the nearest pose within the stops",
-    TrackingStatus.NOT_CONVERGED: "the iteration did not settle; do not use this pose",
-    TrackingStatus.DEGENERATE: "no mirror can do it: source and aim are opposite, or the aim is in "
-    "the mirror",
+    TrackingStatus.NOT_CONVERGED: "the iteration did not converge; do not use this pose",
+    TrackingStatus.DEGENERATE: (
+        "no mirror can reflect the beam there: source and aim are opposite, or the aim is in "
+        "the mirror"
+    ),
     TrackingStatus.BEHIND: "the aim is fixed behind the mirror or in its plane, where no beam goes",
 }
 

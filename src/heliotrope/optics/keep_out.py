@@ -391,7 +391,7 @@ def _verified(
         leg = ("turning the azimuth", "turning the elevation")[k] if k < 2 else f"at aim {k - 1}"
         text = (
             f"the beam enters {motion.volumes[v]} {motion.distance[0, v]:.0f} m from the mirror "
-            f"while {leg}; choose another foot point, standby point or time"
+            f"while {leg}; choose another first point of the path, standby point or time"
         )
     if lost.size:
         k = int(lost[0])

@@ -31,7 +31,9 @@ def equal_facets(width: float, height: float, count: tuple[int, int], focal: flo
             raise InputError(f"mirror: {name} must be above 0 and finite, not {side} m")
     columns, rows = count
     if min(columns, rows) < 1:
-        raise InputError(f"mirror: facets must number 1 or more each way, not {columns} × {rows}")
+        raise InputError(
+            f"mirror: there must be 1 or more facets in each direction, not {columns} × {rows}"
+        )
     x = ((np.arange(columns) + 0.5) / columns - 0.5) * width
     y = ((np.arange(rows) + 0.5) / rows - 0.5) * height
     x, y = (a.ravel() for a in np.meshgrid(x, y))

@@ -400,7 +400,7 @@ def one_sun(plant: Plant, time: Times | None, sun: npt.ArrayLike | None) -> Floa
     if light[2] <= 0.0:
         elevation = np.degrees(np.arcsin(np.clip(light[2], -1.0, 1.0)))
         raise InputError(
-            f"flux: the sun stands {-elevation:.1f}° below the horizon; choose a time in daylight"
+            f"flux: the sun is {-elevation:.1f}° below the horizon; choose a time in daylight"
         )
     return light
 
@@ -575,7 +575,9 @@ def flux_day(
     suns = np.atleast_2d(vector(times, plant.site))
     up = suns[:, 2] > np.sin(LOWEST)
     if not up.any():
-        raise InputError("flux: the sun is above 2° at none of the times; choose other times")
+        raise InputError(
+            "flux: the sun is at or below 2° elevation at all of these times; choose other times"
+        )
     seconds = np.atleast_1d(unix_seconds(times))[up]
     unknown = np.full(len(seconds), np.nan)
     weight = np.full(len(seconds), 1.0 / len(seconds))

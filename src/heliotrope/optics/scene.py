@@ -239,7 +239,7 @@ class Mirrors:
             k = int(np.flatnonzero(outside)[0])
             raise InputError(
                 f"mirror {k}: a facet reaches {reach[k].max():.3f} m from the centre, but the "
-                f"mirror is {self.width[k]:.3f} × {self.height[k]:.3f} m; correct either"
+                f"mirror is {self.width[k]:.3f} × {self.height[k]:.3f} m; correct one of them"
             )
         return replace(self, facets=facets, kind=np.asarray(kind, dtype=np.int64))
 
@@ -283,7 +283,7 @@ class Scene:
             if inside.any():
                 k = int(np.flatnonzero(inside)[0])
                 raise InputError(
-                    f"scene: mirror {k} stands inside a tower of radius {tower.radius} m; move it"
+                    f"scene: mirror {k} is inside a tower of radius {tower.radius} m; move it"
                 )
 
     def with_mirrors(self, mirrors: Mirrors) -> "Scene":

@@ -183,12 +183,12 @@ class Mesh:
             )
         if faces.min() < 0 or faces.max() >= len(vertices):
             raise InputError(
-                f"mesh {self.name}: a face names vertex {faces.max()}; the last is "
+                f"mesh {self.name}: a face uses vertex {faces.max()}, but the last is "
                 f"{len(vertices) - 1}"
             )
         if not (self.cells.area > 1e-12).all():
             k = int(np.flatnonzero(self.cells.area <= 1e-12)[0])
-            raise InputError(f"mesh {self.name}: face {k} has no area; leave it out")
+            raise InputError(f"mesh {self.name}: face {k} has no area; remove it")
 
     @property
     def center(self) -> FloatArray:

@@ -338,7 +338,7 @@ class PlantAssembly:
         await self.operations.begun.wait()
         for target in self.design.targets:
             if not cameras.sees(target.name):
-                self.logbook.event("calibration", target.name, "no camera looks at it")
+                self.logbook.event("calibration", target.name, "no camera views it")
                 continue
             try:
                 await cameras.look(target.name)

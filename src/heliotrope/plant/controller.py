@@ -166,6 +166,9 @@ class PlantController:
     commands, guards, sentinel
         The part that issues operator commands; the guards that block commands, apart from the path
         checks; and the sentinel, with the safety table and the active emergencies.
+    worth
+        How much a smaller squared error of each heliostat counts beside the others when a
+        calibration is chosen, (N,).
     movements, locks, stepping
         Aims that visits have moved, heliostats that they have locked, and fine steps that they
         need; the plant restores whatever a visit leaves behind.
@@ -214,6 +217,7 @@ class PlantController:
         self.movements.recall(points.held["LENT"])
         self._agreement = self._compared(points)
         self._clusters = Clusters(members, links, clock, self.counters)
+        self.worth = np.ones(len(self.field))
         self.join_rate, burst = self.settings.joins(design)
         self._joining = JoinQueue(self.join_rate, burst, self.settings.join_wait)
         self._identities = Identities(

@@ -115,7 +115,7 @@ HOLDER_OUTRANKS = Refusal(
 )
 REASON_MISSING = Refusal(
     "reason missing",
-    "A command that needs a reason for the audit was sent without a reason.",
+    "A command that needs a reason for the audit log was sent without one.",
     "{what}: a reason is needed; enter one",
     "Enter a reason.",
 )
@@ -154,14 +154,14 @@ NOT_NOW = Refusal(
 )
 NOT_RECORDED = Refusal(
     "not recorded",
-    "The audit cannot record the command.",
+    "The audit log cannot record the command.",
     "{what}: not accepted, because it cannot be recorded: {problem}",
     "Check the disk or the database. DEFOCUS and STOW are still sent.",
 )
 BEAM_REFUSED = Refusal(
     "beam",
-    "A beam would enter a keep-out volume, shine into an eye, cross a receiver on its way from "
-    "stow, or cannot reach the point.",
+    "A beam cannot reach the point, or it would enter a keep-out volume, dazzle an observer, "
+    "or cross a receiver on its way from stow.",
     "{what} {heliostat}{more}: {reason}",
     "Choose another point, or leave out the heliostat named in the text.",
 )
@@ -219,7 +219,8 @@ ONE_HELIOSTAT = Refusal(
 )
 NO_POSITION = Refusal(
     "no known position to lock",
-    "LOCK POSITION is ordered where the step counts of the aim cannot be those of the mirror.",
+    "LOCK POSITION is ordered for a heliostat whose mirror may not be at the step counts of "
+    "its aim.",
     "LOCK POSITION: {heliostat}: {why}",
     "Bring the beam to its aim with JOG, lock the heliostat, and repeat the command; if its step "
     "counts are lost, set them with ZERO first.",
@@ -240,16 +241,16 @@ NO_CALIBRATION = Refusal(
 )
 PARAMETERS_DIFFER = Refusal(
     "parameters differ",
-    "A motion is ordered for a heliostat whose stored parameters differ from the wanted ones.",
-    "its stored parameters differ from the wanted ones ({items})",
-    "Stow the heliostat; the wanted parameters are then written. If the text names more than "
+    "A motion is ordered for a heliostat whose stored parameters differ from the intended ones.",
+    "its stored parameters differ from the intended ones ({items})",
+    "Stow the heliostat; the intended parameters are then written. If the text names more than "
     "armature, biases, location and defocus, lock it at stow.",
 )
 NOT_COMPARED = Refusal(
     "not compared",
-    "A motion is ordered for a heliostat whose stored parameters have not been compared with the "
-    "wanted ones since its cluster connected.",
-    "its stored parameters have not been compared with the wanted ones yet",
+    "A motion is ordered for a heliostat whose stored parameters have not been compared with "
+    "the intended ones since its cluster connected.",
+    "its stored parameters have not been compared with the intended ones yet",
     "Wait a few seconds; a lost reply is requested again after 30 s. If the refusal persists, "
     "check its cluster and its supply. DEFOCUS and STOW are still sent.",
 )
@@ -316,15 +317,15 @@ PLACE_UNKNOWN = Refusal(
     "that moved it; or it is sent to its aim but has not reported since its DEFOCUS or STOW; or it "
     "is silent.",
     "no report shows where it is now, so its path cannot be checked",
-    "Try again in two seconds; if it stays silent, check its cluster and its supply. DEFOCUS and "
-    "STOW are accepted at once.",
+    "Try again in two seconds; if it stays silent, check its cluster and its supply. DEFOCUS "
+    "and STOW are accepted immediately.",
 )
 STILL_MOVING = Refusal(
     "still moving",
     "Where there are keep-out volumes: a moving heliostat is ordered to standby, or assigned "
     "another standby point while it is moving there.",
     "it is still moving, so its path to standby cannot be checked",
-    "Wait until it has stopped, then repeat the order. DEFOCUS and STOW are accepted at once.",
+    "Wait until it has stopped, then repeat the order. DEFOCUS and STOW are accepted immediately.",
 )
 SEEN_ASTRAY = Refusal(
     "pointing error seen from the air",

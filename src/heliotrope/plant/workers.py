@@ -79,8 +79,8 @@ class WorkerProcesses:
                 end(used)
                 self._pool = pool(self._count, _NICE)
             raise InputError(
-                "the process that computes beside the plant has ended; the next computation begins "
-                "another; if it ends again, see whether the machine runs out of memory"
+                "the plant's computing process has ended; the next computation starts a new "
+                "one; if it ends again, check whether the computer runs out of memory"
             ) from None
 
     def close(self) -> None:

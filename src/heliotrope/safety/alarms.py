@@ -114,9 +114,9 @@ PARAMETERS_DIFFER = AlarmKind(
     "parameters_differ",
     _PLANT,
     Severity.WARNING,
-    "A local controller stores parameters that differ from the wanted ones.",
-    "{subject}: stored parameters differ from the wanted ones: {items}",
-    "No motion except DEFOCUS and STOW is accepted; the wanted parameters are written as soon as "
+    "A local controller stores parameters that differ from the intended ones.",
+    "{subject}: stored parameters differ from the intended ones: {items}",
+    "No motion except DEFOCUS and STOW is accepted; the intended parameters are written as soon as "
     "someone has the command authority and the heliostat is where its beam is safe.",
     "Stow the heliostat; if more than armature, biases, location and defocus differ, lock it at "
     "stow. If the alarm returns, replace the controller's flash memory.",
@@ -144,7 +144,7 @@ UNLISTED = AlarmKind(
     "The mirror stays as it is while the cluster sends sun vectors, and no command by name reaches "
     "the heliostat. DEFOCUS and STOW of the whole cluster do reach it, and so does EMERGENCY, but "
     "nothing can prove that its beam is off.",
-    "Send EMERGENCY if its beam may be out; then add it to the cluster's file and "
+    "Send EMERGENCY if its mirror may not be at stow; then add it to the cluster's file and "
     "restart the cluster.",
     over="{subject}: cluster {cluster} lists it again",
 )
@@ -152,7 +152,7 @@ SECOND_PLANT = AlarmKind(
     "second_plant",
     _PLANT,
     Severity.ALARM,
-    "Clusters belong to another plant with the same keys, which was there before this one.",
+    "Clusters belong to another plant with the same keys, which was running before this one.",
     "this plant (run {run}) is the second one with its keys: {clusters} belong to run {holder}",
     "These clusters accept only DEFOCUS, STOW and EMERGENCY from this plant until this plant is "
     "restarted.",
@@ -163,8 +163,8 @@ SETTINGS_DIFFER = AlarmKind(
     "cluster_settings_differ",
     _PLANT,
     Severity.WARNING,
-    "For 5 s, periods or safety thresholds of a cluster have differed from those that the plant "
-    "expects, or where it expects none, from those of most other clusters.",
+    "For 5 s, polling periods or safety thresholds of a cluster have differed from those that "
+    "the plant expects or, where it expects none, from those of most other clusters.",
     "cluster {subject}: its settings differ from those of {others}",
     "The cluster continues with its own settings.",
     "Compare [polling] of its cluster file with that of the plant's links file, delta_t_s and "
@@ -178,9 +178,8 @@ FIRMWARE_DIFFERS = AlarmKind(
     Severity.WARNING,
     "Boards on a cluster's bus have a firmware version that differs from the one that the plant "
     "expects.",
-    "cluster {subject}: {boards} have other firmware than version {expected}, which this plant "
-    "expects",
-    "The boards continue with their present firmware.",
+    "cluster {subject}: {boards} do not have firmware version {expected}, which this plant expects",
+    "The boards continue with their current firmware.",
     "Install the expected version on them, or correct firmware in the links file. The bus is "
     "searched when the cluster connects.",
     over="cluster {subject}: all boards that answer have the expected firmware",
@@ -189,7 +188,7 @@ SUN_CONTRADICTED = AlarmKind(
     "sun_contradicted",
     _PLANT,
     Severity.ALARM,
-    "An independent witness sees the sun elsewhere than the plant computes it: the time or site "
+    "An independent witness does not see the sun where the plant computes it: the time or site "
     "that plant and clusters share is wrong.",
     "{problem}, at {at} UTC by the plant's clock",
     "No heliostat leaves stow or joins a receiver; tracking heliostats continue, but their beams "
@@ -206,17 +205,18 @@ FLUX_DISAGREES = AlarmKind(
     "than four standard deviations.",
     "receiver {receiver}: {measured:.0f} kW are measured and {predicted:.0f} kW predicted; the "
     "flux is {far:.0f} standard deviations off",
-    "The field goes on as it is.",
-    "Compare both maps (tab Plant): if beams are beside their place, look for a wrong clock, a "
-    "wrong calibration or a moved receiver; if all is darker, for clouds over the field, dirt, or "
-    "a wrong sensor of irradiance or flux.",
+    "The field continues unchanged.",
+    "Compare both maps (tab Plant): if beams are displaced, look for a wrong clock, a wrong "
+    "calibration or a moved receiver; if the whole map is darker, look for clouds over the "
+    "field, dirt, or a faulty irradiance or flux sensor.",
     over="receiver {receiver}: the measured flux agrees with the predicted one again",
 )
 UNWITNESSED = AlarmKind(
     "unwitnessed",
     _PLANT,
     Severity.WARNING,
-    "No independent witness has agreed with the plant's sun today; worse where one is required.",
+    "No independent witness has confirmed the plant's sun position today; an alarm instead of "
+    "a warning where a witness is required.",
     "no independent witness has seen the sun today where the plant computes it: {problem}",
     "Where a witness is required, no heliostat joins a receiver. Where none is required, a wrong "
     "time or site that the plant and the clusters share goes undetected.",
@@ -301,12 +301,13 @@ AIMS = AlarmKind(
     "aims",
     _PLANT,
     Severity.ALARM,
-    "No aims were found that hold the flux limit, or none came within deadline_s.",
+    "No aims were found that respect the flux limit, or none were found within deadline_s.",
     "aims under the flux limit: {problem}",
-    "The last good aims stay; after five times deadline_s the field goes to the safe spread.",
-    "Return beams that an operator has aimed to automatic control (Automatic); else defocus some "
-    "heliostats, and correct [aims] in the plant file.",
-    over="aims hold the flux limit again",
+    "The last good aims stay in use; after five times deadline_s the field goes to the safe "
+    "spread.",
+    "Return beams that an operator has aimed to automatic control (Automatic); otherwise "
+    "defocus some heliostats, and correct [aims] in the plant file.",
+    over="the aims respect the flux limit again",
 )
 FLUX_ABOVE_LIMIT = AlarmKind(
     "flux_above_limit",
@@ -347,7 +348,7 @@ ORDERS_REFUSED = AlarmKind(
     _PLANT,
     Severity.WARNING,
     "Five orders within five minutes were refused because the caller's role is too low.",
-    "orders are refused again and again: {who} from {address} has too low a role",
+    "orders are refused repeatedly: the role of {who} from {address} is too low",
     "Nothing was sent; everyone who is signed in can still order EMERGENCY.",
     "Ask that user; if the orders are not theirs, revoke the token or disable the account.",
     over="no order was refused for ten minutes",
@@ -356,8 +357,8 @@ CERTIFICATE = AlarmKind(
     "certificate",
     _PLANT,
     Severity.WARNING,
-    "A certificate expires within 30 days, or its expiry date is unknown; an alarm once it has "
-    "expired. It is repeated each day.",
+    "A certificate expires within 30 days, or its expiry date is unknown; the warning becomes "
+    "an alarm once the certificate has expired. It is repeated each day.",
     "{problem}",
     "Existing connections continue; after the certificate expires, no new TLS connection is "
     "possible.",
@@ -384,7 +385,7 @@ SYSLOG = AlarmKind(
     "security events and alarms are not being forwarded: {problem}",
     "The store keeps them; up to 10,000 wait for the receiver, and any beyond that number never "
     "reach it.",
-    "Check the receiver, its certificate and the network between.",
+    "Check the receiver, its certificate and the network in between.",
     over="security events and alarms are being forwarded again; {count} were lost since the start",
 )
 HEADS = AlarmKind(
@@ -404,7 +405,7 @@ RECORD_REFUSED = AlarmKind(
     "The store refuses a record because of its content; the disk and the database work.",
     "a record was refused: {problem}",
     "This record is lost; all others are stored.",
-    "Report the text.",
+    "Report this message to Heliotrope's maintainers.",
     over="a record was refused: {problem}; the records after it are stored",
 )
 WORK = AlarmKind(
@@ -414,7 +415,8 @@ WORK = AlarmKind(
     "A part of automatic control failed.",
     "automatic control, part {subject}, failed: {reason}",
     "This part is restarted after 5 s.",
-    "Report the text; until this part works again, command the field by hand.",
+    "Report this message to Heliotrope's maintainers; until this part works again, command the "
+    "field by hand.",
     over="automatic control, part {subject}, works again",
 )
 RESUME_NEEDED = AlarmKind(
@@ -422,7 +424,7 @@ RESUME_NEEDED = AlarmKind(
     _PLANT,
     Severity.ALARM,
     "More heliostats than `losses` or `losses_share` allow left the receiver within 30 s without "
-    "an order, or an emergency held when the last program ended.",
+    "an order, or an emergency was active when the plant's program last ended.",
     "{what} at {since} UTC",
     "Automatic control waits and raises no heliostat.",
     "Find the cause, make sure that nobody is in the field, then press Resume.",
@@ -435,8 +437,8 @@ BEAM_BLOCKED = AlarmKind(
     "The beam of a heliostat would enter a keep-out volume at its aim or on its way there, or "
     "cross a receiver on its way from stow.",
     "{subject}: {reason}",
-    "Automatic control stows it if it is defocused, since the path from stow may be free; else it "
-    "leaves it where it is and tries again every five minutes.",
+    "Automatic control stows it if it is defocused, since the path from stow may be free; "
+    "otherwise it leaves it where it is and tries again every five minutes.",
     "If a receiver is in the way, wait until the sun has moved on. Otherwise set another aim "
     "point, or correct the volume in the plant file.",
     over="{subject}: it has left the blocked position",
@@ -458,8 +460,8 @@ BEAM_DISPROVED = AlarmKind(
     "In a joint visit a heliostat's beam did not move with its aim, moved where another "
     "heliostat's beam should be, or was far from its expected position.",
     "{subject}: in a joint visit, {problem}",
-    "The results of that visit are not used for this heliostat; its next visit is alone.",
-    "If the beam does not move, check the drives and couplings; if it is exchanged with another "
+    "The results of that visit are not used for this heliostat; its next visit takes place alone.",
+    "If the beam does not move, check the drives and couplings; if it is swapped with another "
     "heliostat's, check the addresses and the bus wiring.",
     over="{subject}: a photograph has shown its own beam at the expected position",
 )
@@ -480,24 +482,24 @@ RAISING_GIVEN_UP = AlarmKind(
     "raising_given_up",
     _PLANT,
     Severity.WARNING,
-    "Within half an hour each a heliostat has left the receiver without an order, or could not "
-    "continue from its position, five times in a row.",
+    "Five times in a row, each within half an hour of the last, a heliostat has left the "
+    "receiver without an order or could not continue from its position.",
     "{subject}: {count} attempts in a row to raise it failed; the last time it {reason}",
     "Automatic control no longer raises it; after 16 hours there is one more attempt.",
     "Find the cause (tab Heliostat, tab Logs): its supply, its cluster or a fault; then press "
     "Automatic.",
-    over="{subject}: it is up, or a person has given it to automatic control again",
+    over="{subject}: it is raised, or a person has returned it to automatic control",
 )
 NOT_PARKED = AlarmKind(
     "not_parked",
     _PLANT,
     Severity.ALARM,
-    "A heliostat was taken out of service, and was not seen in stow within five minutes.",
+    "A heliostat was taken out of service, and did not report stow within five minutes.",
     "{subject}: it is out of service and not in stow: {reason}",
-    "STOW is sent to it once a minute until it is seen in stow.",
-    "Nobody may go to its mirror; its beam is where its state says, or its position is unknown. "
+    "STOW is sent to it once a minute until it reports that it is in stow.",
+    "Nobody may approach its mirror; its beam is where its state says, or its position is unknown. "
     "Check its fault, its supply and its cable.",
-    over="{subject}: it is in stow, or was given back to service",
+    over="{subject}: it is in stow, or was returned to service",
 )
 VISITS_FAIL = AlarmKind(
     "visits_fail",
@@ -539,7 +541,7 @@ NODE_SILENT = AlarmKind(
     "{subject}: no reply for {silence:g} s; {last}",
     "The cluster keeps polling it.",
     "Assume that its beam has not moved; check its supply and its cable.",
-    over="{subject}: it answers again",
+    over="{subject}: it replies again",
     worse=Severity.ALARM,
 )
 NODE_FAULT = AlarmKind(
@@ -566,8 +568,8 @@ SUN_JUMPED = AlarmKind(
     "sun_jumped",
     _CLUSTER,
     Severity.WARNING,
-    "A local controller was sent a sun vector that is impossible after the previous one.",
-    "{subject}: its cluster sent a sun vector that is impossible after the previous one",
+    "A local controller was sent a sun vector that cannot follow from the previous one.",
+    "{subject}: its cluster sent a sun vector that cannot follow from the previous one",
     "It refused that sun vector, or accepted it after a gap; if it was tracking, it has turned "
     "away.",
     "Check the clock, the time source and the site of the cluster.",

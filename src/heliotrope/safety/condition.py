@@ -258,7 +258,7 @@ class Condition:
         whole = target.get(self.scope, "the field")
         text = {
             Act.ALARM: f"Nothing moves or stops in {whole}",
-            Act.REFUSE_NEW: f"New motions of {whole} are refused; running motions go on",
+            Act.REFUSE_NEW: f"New motions of {whole} are refused; running motions continue",
             Act.HOLD: f"HOLD: {whole} stops where it is",
             Act.DEFOCUS: f"{self.ordered(Act.DEFOCUS)} of {whole}",
             Act.STOW: f"STOW of {whole}",

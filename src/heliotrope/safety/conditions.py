@@ -82,7 +82,7 @@ def _orders() -> tuple[Condition, ...]:
         ),
         Condition(
             "flux_after_emergency", _PLANT, "flux_after_emergency", "share",
-            "flux on the receiver after an emergency order, of its nominal value",
+            "flux on the receiver after an emergency order, as a fraction of nominal",
             "flux on the receiver is {value} of nominal after an emergency order, or not known",
             0.10, 0.08, _STOW, _FIELD, _EMERGENCY, 300.0, role=_SUPERVISOR,
             release="the flux is gone, or the emergency is over",
@@ -114,7 +114,8 @@ def _receiver() -> tuple[Condition, ...]:
     return (
         Condition(
             "receiver_flux_high", _PLANT, "receiver_flux", "share",
-            "flux on the receiver, of its limit", "flux on the receiver is {value} of its limit",
+            "flux on the receiver as a fraction of its limit",
+            "flux on the receiver is {value} of its limit",
             1.0, 0.9, _DEFOCUS, _FIELD, _EMERGENCY, 30.0, delay=1.0, stale_after=5.0,
             clear_for=10.0, role=_OPERATOR, release="the flux is well below its limit",
             remedy="Let the receiver cool; return with fewer heliostats or other aim points.",
@@ -122,7 +123,7 @@ def _receiver() -> tuple[Condition, ...]:
         ),
         Condition(
             "receiver_temperature_high", _PLANT, "receiver_temperature", "share",
-            "temperature of the receiver, of its limit",
+            "temperature of the receiver as a fraction of its limit",
             "temperature of the receiver is {value} of its limit", 1.0, 0.95, _DEFOCUS, _FIELD,
             _EMERGENCY, 30.0, delay=1.0, stale_after=5.0, clear_for=60.0, role=_OPERATOR,
             release="the temperature is well below its limit",
@@ -130,7 +131,7 @@ def _receiver() -> tuple[Condition, ...]:
         ),
         Condition(
             "receiver_flow_low", _PLANT, "receiver_flow", "share",
-            "flow through the receiver, of its demand",
+            "flow through the receiver as a fraction of demand",
             "flow through the receiver is {value} of demand",
             0.8, 0.9, _DEFOCUS, _FIELD, _EMERGENCY, 30.0, delay=1.0, stale_after=3.0,
             clear_for=30.0, role=_OPERATOR, release="the flow is back",
@@ -175,9 +176,9 @@ def _weather() -> tuple[Condition, ...]:
         ),
         Condition(
             "cold", _PLANT, "temperature", "°C", "air temperature",
-            "the air is at {value}: ice may hold drives, and a stalled drive reports steps that the"
-            " mirror has not made", 1.0, 4.0, _REFUSE, _FIELD, _WARNING, 65.0, clear_for=1800.0,
-            stale_after=60.0, release="the air is warm again",
+            "the air is at {value}: ice may block the drives, and a stalled drive reports "
+            "steps that the mirror has not made", 1.0, 4.0, _REFUSE, _FIELD, _WARNING, 65.0,
+            clear_for=1800.0, stale_after=60.0, release="the air is warm again",
             remedy="Wait until it is warmer; check the mirrors for ice before heliostats leave "
                 "stow.", site=(-20.0, 20.0),
         ),
@@ -215,7 +216,8 @@ def _links(autonomy: float) -> tuple[Condition, ...]:
             remedy="Check Mosquitto and the computer on which it runs.",
         ),
         Condition(
-            "bus_errors", _CLUSTER, "bus_errors", "share", "bad frames on the bus within 10 s",
+            "bus_errors", _CLUSTER, "bus_errors", "share",
+            "share of bad frames on the bus over 10 s",
             "{value} of the frames on the bus are bad",
             0.2, 0.05, _REFUSE, _BUS, _WARNING, 20.0, delay=5.0, clear_for=30.0,
             release="the bus is sound again",
@@ -224,7 +226,8 @@ def _links(autonomy: float) -> tuple[Condition, ...]:
             site=(0.02, 0.5),
         ),
         Condition(
-            "bus_failed", _CLUSTER, "bus_errors", "share", "bad frames on the bus within 10 s",
+            "bus_failed", _CLUSTER, "bus_errors", "share",
+            "share of bad frames on the bus over 10 s",
             "{value} of the frames on the bus are bad",
             0.9, 0.2, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=2.0,
             clear_for=30.0, release="the bus works again",
@@ -302,13 +305,13 @@ def _power_and_records() -> tuple[Condition, ...]:
             "ups_charge_low", _PLANT, "ups_charge", "share", "charge of the UPS",
             "charge of the UPS is {value}",
             0.5, 0.8, _STOW, _FIELD, _SERIOUS, 300.0, clear_for=60.0, stale_after=30.0,
-            release="the UPS is charged", remedy="Restore the mains supply at once.",
+            release="the UPS is charged", remedy="Restore the mains supply immediately.",
             site=(0.2, 0.9),
         ),
         Condition(
             "database_unwritable", _PLANT, "audit_silence", "s",
-            "time since the audit last confirmed a write",
-            "the audit has not confirmed a write for {value}",
+            "time since the audit log last confirmed a write",
+            "the audit log has not confirmed a write for {value}",
             5.0, 2.0, _REFUSE, _FIELD, _SERIOUS, 10.0, ages=True, clear_for=5.0,
             release="writes are confirmed",
             remedy="Check the disk or the database; the alarm records gives the reason.",
@@ -334,7 +337,7 @@ def _mirrors() -> tuple[Condition, ...]:
             "its beam is on a receiver, but it was not sent there", 0.5, 0.4, _DEFOCUS, _HELIOSTAT,
             _SERIOUS, 30.0, then_stow=10.0, or_stow=True, delay=5.0,
             release="the beam is off the receiver",
-            remedy="If it stays, inspect the heliostat; to hold it, lock it at stow.",
+            remedy="If it stays there, inspect the heliostat; to hold it, lock it at stow.",
             site=(0.5, 0.5),
         ),
         Condition(
@@ -360,18 +363,18 @@ def _mirrors() -> tuple[Condition, ...]:
         ),
         Condition(
             "node_faults", _PLANT, "node_fault_share", "share",
-            "heliostats that failed within 600 s",
+            "share of the heliostats that failed within 600 s",
             "{value} of the heliostats failed within 600 s", 0.02, 0.01, _REFUSE, _FIELD,
             _WARNING, 20.0, delay=5.0, clear_for=60.0, role=_OPERATOR, release="few faults",
-            remedy="Find what they share: a cluster, a supply, a firmware version.",
+            remedy="Find out what they share: a cluster, a supply, a firmware version.",
             site=(0.002, 0.2),
         ),
         Condition(
             "node_faults_many", _PLANT, "node_fault_share", "share",
-            "heliostats that failed within 600 s",
+            "share of the heliostats that failed within 600 s",
             "{value} of the heliostats failed within 600 s", 0.10, 0.05, _DEFOCUS, _FIELD,
             _SERIOUS, 30.0, delay=5.0, clear_for=60.0, role=_SUPERVISOR, release="few faults",
-            remedy="Find at once what they share: a cluster, a supply, a firmware version.",
+            remedy="Find out immediately what they share: a cluster, a supply, a firmware version.",
             site=(0.01, 0.3),
         ),
     )  # fmt: skip

@@ -242,7 +242,8 @@ def restore(
         database.lock()
         if database.revision():
             raise StoreError(
-                f"store {database.name}: it already exists; choose an empty place, or move it away"
+                f"store {database.name}: it already exists; choose a new location, or move the "
+                "existing store away"
             )
         if telemetry is not None and (restored.folder / TELEMETRY).is_dir():
             if Path(telemetry).exists() and any(Path(telemetry).iterdir()):

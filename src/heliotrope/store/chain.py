@@ -402,7 +402,7 @@ def _verify_head(connection: Connection, head: Head) -> bool:
         if head.number == anchor:
             digest = _anchor(connection, EVENT)
     if digest != head.digest:
-        what = "is not there" if digest is None else "has another digest"
+        what = "is missing" if digest is None else "has a different digest"
         raise StoreError(
             f"head {head}: link {head.number} {what}; records have since been removed or rewritten"
         )

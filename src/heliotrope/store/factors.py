@@ -111,7 +111,9 @@ class Factors:
                 raise InputError(f"account {name}: begin to set up a second factor first")
             step = self._step(name, factor.word, 0, code, now)
             if step is None:
-                raise InputError("the code is wrong; check the clock of the device that made it")
+                raise InputError(
+                    "the code is wrong; check the clock of the device that generated it"
+                )
             mine = _FACTOR.update().where(_FACTOR.c.name == name)
             connection.execute(mine.values(confirmed=True, used=step))
             connection.execute(_RECOVERY.delete().where(_RECOVERY.c.name == name))
@@ -225,7 +227,7 @@ class Factors:
             if connection.execute(select(_FACTOR.c.name).where(_FACTOR.c.confirmed)).first():
                 raise InputError(
                     f"key file {self._file}: it is missing, so no code of an authenticator can be "
-                    "checked; put it back, or sign in by recovery codes"
+                    "checked; restore it, or sign in with recovery codes"
                 )
         key = self._entropy(_BYTES)
         try:

@@ -87,7 +87,7 @@ def _alarms(connection: Connection, query: JournalQuery) -> list[JournalEntry]:
 
 
 def _alarm_text(alarm: AlarmEntry) -> str:
-    ends = "" if alarm.cleared is None else f"; over at {_clock(alarm.cleared)}"
+    ends = "" if alarm.cleared is None else f"; cleared at {_clock(alarm.cleared)}"
     if alarm.acknowledged is not None:
         ends += f"; acknowledged by {alarm.acknowledged_by} at {_clock(alarm.acknowledged)}"
     return f"{alarm.text}{ends}"

@@ -193,7 +193,7 @@ class Keeper:
         if len(sightings) and int(sightings.heliostat.max()) >= len(names):
             raise InputError(
                 f"sightings: heliostat row {int(sightings.heliostat.max())}, but there are only "
-                f"{len(names)} names"
+                f"{len(names)} names; pass the names of all heliostats"
             )
         first = self._take_numbers(tables.sighting, len(sightings))
         numbers = np.arange(first, first + len(sightings), dtype=np.int64)

@@ -327,10 +327,10 @@ class RenderedCamera:
             place = reading.spots[0].plane
             raise InputError(
                 f"target {target}: a beam is on it, {place[0]:.2f} m right of and "
-                f"{place[1]:.2f} m above its middle; take the empty frame before one comes"
+                f"{place[1]:.2f} m above its middle; take the empty frame before a beam arrives"
             )
         if not reading.found.found:
-            raise InputError(f"target {target}: {reading.found.reason}; look at the camera")
+            raise InputError(f"target {target}: {reading.found.reason}; check the camera")
         self._empty[target] = picture.frame
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:

@@ -133,8 +133,8 @@ class Drawer:
             except (EOFError, OSError) as error:
                 self._end()
                 raise FetchError(
-                    f"{exposure.title}: the process that draws photographs has ended; "
-                    "the next photograph begins another"
+                    f"{exposure.title}: the process that draws photographs has ended; the next "
+                    "photograph starts a new one"
                 ) from error
         if isinstance(answer, str):
             raise InputError(answer)

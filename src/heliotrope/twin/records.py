@@ -71,7 +71,7 @@ class RecordsDisk:
             If the disk is full.
         """
         if self.full:
-            raise AuditError("audit: no space left on the simulated disk; make room")
+            raise AuditError("audit: no space left on the simulated disk; free some space")
 
 
 class DiskQueue:

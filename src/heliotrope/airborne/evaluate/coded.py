@@ -78,7 +78,7 @@ def read_targets(photos: Sequence[Photo], camera: LedCamera) -> tuple[SeenTarget
 
 def _read(photo: Photo, camera: LedCamera) -> SeenTargets:
     if photo.path is None:
-        return _none("there is no file")
+        return _none("no such file")
     try:
         picture = decode(photo.path)
     except HeliotropeError as error:

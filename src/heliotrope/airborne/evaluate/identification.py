@@ -391,7 +391,7 @@ def _choose(
         text = (
             f"wrong_field: {len(best.mirror)} patches match the {ranked[0].inside} mirrors of the "
             "field that should be in it; check the field, the commands, and the gimbal angles "
-            f"({np.degrees(GIMBAL):.0f}° off are found)"
+            f"(errors of up to {np.degrees(GIMBAL):.0f}° are corrected)"
         )
         return Identified(photo.rotation, none, none, text), None
     for other in ranked[1:]:
@@ -399,8 +399,8 @@ def _choose(
         if ranked[0].differs(other) and close:
             text = (
                 f"ambiguous: {len(other.solution.mirror)} mirrors match if the camera pointed "
-                f"elsewhere, {len(best.mirror)} as it is; record the gimbal more accurately or "
-                "photograph more of the field"
+                f"elsewhere, {len(best.mirror)} with the recorded angles; record the gimbal "
+                "more accurately or photograph more of the field"
             )
             return Identified(photo.rotation, none, none, text), None
     return Identified(as_float(best.rotation), rows[best.mirror], best.patch), ranked[0]

@@ -197,8 +197,8 @@ def _turned(
     if not off[worst] < _OFF:
         name, corner = matches.heliostat[rows[worst]], matches.corner[rows[worst]]
         return (
-            f"{name}, {corner}, is {gap[worst]:.0f} px from the position that the other places "
-            "imply; correct its name or its place"
+            f"{name}, {corner}, is {gap[worst]:.0f} px from the position that the other mirrors "
+            "imply; correct its name or its position"
         )
     return replace(current, by_hand=True)
 

@@ -84,8 +84,8 @@ def overlay(picture: Picture, camera: LedCamera, photo: Photo, stand: MirrorPose
     if not best or best[0].fit < LEAST:
         fit = f"{100 * best[0].fit:.0f} %" if best else "nothing"
         text = (
-            f"wrong_field: the {len(rows)} mirrors that should be in it correlate to {fit} with "
-            "it; check the field and the commands"
+            f"wrong_field: the {len(rows)} mirrors that should be in view match the photograph "
+            f"to {fit}; check the field and the commands"
         )
         return Identified(photo.rotation, none, none, text)
     first = best[0]
@@ -93,8 +93,8 @@ def overlay(picture: Picture, camera: LedCamera, photo: Photo, stand: MirrorPose
         gap = float(np.nanmedian(np.linalg.norm(other.middle - first.middle, axis=-1)))
         if gap > _APART * float(np.median(side[rows])) and other.fit > first.fit - MARGIN:
             text = (
-                f"ambiguous: the mirrors fit {gap:.0f} px away as well ({100 * other.fit:.0f} % "
-                f"there, {100 * first.fit:.0f} % as it is); record the gimbal more accurately or "
+                f"ambiguous: the mirrors also fit {gap:.0f} px away ({100 * other.fit:.0f} % "
+                f"there, {100 * first.fit:.0f} % here); record the gimbal more accurately or "
                 "photograph the end of a row"
             )
             return Identified(photo.rotation, none, none, text)

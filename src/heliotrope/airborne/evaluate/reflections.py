@@ -147,7 +147,7 @@ def write_reflections(path: str | Path, found: Reflections, names: Sequence[str]
     if len(found) and int(found.heliostat.max()) >= len(names):
         raise InputError(
             f"reflections: heliostat row {int(found.heliostat.max())}, but there are only "
-            f"{len(names)} names"
+            f"{len(names)} names; pass the names of all heliostats"
         )
     columns: dict[str, object] = {
         "photo": found.photo,

@@ -184,7 +184,7 @@ def calibration_points(
     free = _free(airspace, points, towards, mirrors, rows, sampling)
     if not free.any():
         raise InputError(
-            f"{label}: heights, fence or keep-outs leave no place at {sampling.distance:g} m; "
+            f"{label}: heights, fence or keep-outs allow no position at {sampling.distance:g} m; "
             "lower the distance or the elevations, or raise the upper height limit"
         )
     towards, points = towards[free], points[free]

@@ -66,10 +66,14 @@ class FitOutcome(IntEnum):
 
 _TEXTS = {
     FitOutcome.CONVERGED: "converged",
-    FitOutcome.NOT_CONVERGED: "the iteration did not settle; the parameters may not be the best",
+    FitOutcome.NOT_CONVERGED: (
+        "the iteration did not converge; the parameters may not be the best fit"
+    ),
     FitOutcome.TOO_FEW: "no sightings, so the parameters stay at their prior values",
     FitOutcome.FAILED: "the residuals are not finite from the start; check the nominal mechanism",
-    FitOutcome.MISFIT: "no plausible parameters explain the sightings; they stay at the prior",
+    FitOutcome.MISFIT: (
+        "no plausible parameters explain the sightings; the parameters stay at their prior values"
+    ),
     FitOutcome.UNMOVED: "the mirror did not move, so the parameters stay at their prior values",
     FitOutcome.CLOCK: "the clock may be wrong, and the parameters would absorb its error",
 }
@@ -401,8 +405,7 @@ def names_of(model: str | Sequence[str], mechanism: Mechanism) -> tuple[str, ...
         if not isinstance(name, str):
             raise InputError(
                 f"model: {kind_of(name)} is not the name of a parameter; pass parameter names "
-                "(fit_terms fits own terms of drives, and its result gives sightings without "
-                "them)"
+                "(to fit error terms of your own, use fit_terms)"
             )
         mechanism.parameter(name)
     return tuple(model)

@@ -362,7 +362,8 @@ def _scatter(white: FloatArray, sigma: FloatArray) -> str:
     beam = 1e3 * float(np.median(white * sigma))
     return (
         f"half of its beams are more than {beam:.2f} mrad, {np.median(white):.0f} times their "
-        "sigma, from where the others put them; specify the true sigma, or check model and counts"
+        "sigma, from where its other sightings predict them; specify the true sigma, or check "
+        "model and counts"
     )
 
 
@@ -374,11 +375,12 @@ def _reason(beyond: int, unexplained: int, count: int) -> str:
         )
     if unexplained > NOTHING * count:
         return (
-            f"{unexplained} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from where "
-            "the others put them; no parameters explain them together. Probably the counts were "
-            "recorded wrongly."
+            f"{unexplained} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from "
+            "where its other sightings predict them; no set of parameters explains all of them. "
+            "Probably the counts were recorded wrongly."
         )
     return (
-        f"{unexplained} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from where the "
-        "others, which agree, put them. Probably these photographs show another mirror's beam."
+        f"{unexplained} of {count} beams were more than {1e3 * ELSEWHERE:.0f} mrad from where "
+        "its other sightings, which agree, predict them. Probably these photographs show "
+        "another mirror's beam."
     )

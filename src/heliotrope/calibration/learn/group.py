@@ -180,7 +180,7 @@ def described(hyper: Hyperparameters) -> str:
         time = f"{tau[group]:.0f} days" if tau[group] >= 2.0 else f"{24 * tau[group]:.1f} hours"
         parts.append(f"{what} by {sizes} mrad over {time}")
     parts.append(f"a step in {1.0 / hyper.rate:.0f} days" if hyper.rate > 0.0 else "no steps")
-    parts.append(f"noise {hyper.noise:.2f} of a photograph's sigma")
+    parts.append(f"noise {hyper.noise:.2f} times a photograph's sigma")
     return ", ".join(parts)
 
 
@@ -224,5 +224,7 @@ def read_hyperparameters(document: dict[str, Any]) -> Hyperparameters:
         raise InputError(f"hyperparameters: {error!r}; learn the group again") from error
     figures = np.concatenate([*arrays.values(), list(numbers.values())])
     if not (all(sizes) and np.isfinite(figures).all() and hyper.noise > 0.0):
-        raise InputError("hyperparameters: shapes or figures do not fit; learn the group again")
+        raise InputError(
+            "hyperparameters: array shapes or values are inconsistent; learn the group again"
+        )
     return hyper

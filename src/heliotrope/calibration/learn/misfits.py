@@ -159,8 +159,8 @@ def scattered(row: int, white: FloatArray, sigma: FloatArray) -> Misfit | None:
         FitOutcome.MISFIT,
         f"half of its {amount(len(white), 'beam')} are more than "
         f"{1e3 * np.median(white * sigma):.1f} mrad, {np.median(white):.0f} times their sigma, "
-        "from where the others put them: no parameters explain them; check counts, gear ratio and "
-        "the log",
+        "from where its other sightings predict them: no parameters explain them; check counts, "
+        "gear ratio and the log",
     )
 
 
@@ -219,9 +219,10 @@ def _of_photographs(
     if np.median(errors) > ELSEWHERE:
         return
     text = (
-        f"the photographs of the targets seem {best}: read like that, the sightings of "
-        f"{amount(len(chosen), 'heliostat')} fit to {1e3 * np.median(errors):.2f} mrad of beam "
-        f"instead of {1e3 * np.median(error):.2f}; correct the camera or what stores its frames"
+        f"the photographs of the targets seem {best}: read that way, the sightings of "
+        f"{amount(len(chosen), 'heliostat')} fit with a beam error of "
+        f"{1e3 * np.median(errors):.2f} mrad instead of {1e3 * np.median(error):.2f}; correct "
+        "the camera or the program that stores its frames"
     )
     for row in np.flatnonzero(counts):
         yield Misfit(int(row), FitOutcome.MISFIT, text)
@@ -255,7 +256,7 @@ def _unmoved(mechanism: Mechanism, sightings: Sightings) -> Iterator[Misfit]:
                 int(row),
                 FitOutcome.UNMOVED,
                 f"the mirror did not move: {amount(len(mine), 'sighting')} under different sun "
-                "directions have the same counts; check its motors and the log of the counts",
+                "positions have the same counts; check its motors and the log of the counts",
             )
 
 
@@ -287,16 +288,18 @@ def _hopeless(
     broken = outcome not in (FitOutcome.CONVERGED, FitOutcome.NOT_CONVERGED)
     if broken or error > HOPELESS:
         if still:
-            return f"the counts of {' and '.join(still)} did not change; check motor and log"
-        remainder = "" if broken else f", the best leave {1e3 * error:.0f} mrad of beam"
+            return (
+                f"the counts of {' and '.join(still)} did not change; check the motor and the log"
+            )
+        remainder = "" if broken else f", the best leave a beam error of {1e3 * error:.0f} mrad"
         return (
             f"no plausible parameters explain its {amount(len(mine), 'sighting')}{remainder}; "
             "check the counts, the heliostat's name and its entry in the plant file"
         )
     if len(mine) < WITNESSES and strain > DOUBTFUL:
         return (
-            f"{amount(len(mine), 'sighting')} would need parameters {np.sqrt(strain):.0f} standard "
-            f"deviations from the nominal ones; make at least {WITNESSES}"
+            f"{amount(len(mine), 'sighting')} would need parameters {np.sqrt(strain):.0f} "
+            f"standard deviations from their nominal values; take at least {WITNESSES}"
         )
     return None
 
@@ -329,8 +332,8 @@ def _mistake(mechanism: Mechanism, mine: Sightings, row: int, names: tuple[str, 
     ]
     text = trials[best].text.format(" and ".join(dict.fromkeys(f"{r:.2f}" for r in ratios)))
     return (
-        f"{text}; read like that, its {amount(len(mine), 'sighting')} fit to "
-        f"{1e3 * error[best]:.2f} mrad of beam"
+        f"{text}; read that way, its {amount(len(mine), 'sighting')} fit with a beam error of "
+        f"{1e3 * error[best]:.2f} mrad"
     )
 
 
@@ -424,7 +427,7 @@ def _hypotheses(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Tr
         )
         turned = part.counts[:, ::-1].copy()
         yield _Trial(
-            f"its axes seem exchanged: the counts of {joints[0]} are those of {joints[1]}",
+            f"its axes seem swapped: the counts of {joints[0]} are those of {joints[1]}",
             row,
             replace(part, counts=turned),
         )
@@ -432,13 +435,13 @@ def _hypotheses(mechanism: Mechanism, part: Sightings, row: int) -> Iterator[_Tr
             other = turned.copy()
             other[:, d] = _reversed(mechanism, replace(part, counts=turned), row, d)
             yield _Trial(
-                f"its axes seem exchanged, and {joint} reversed",
+                f"its axes seem swapped, and {joint} reversed",
                 row,
                 replace(part, counts=other),
             )
     for text, sign in (
         ("the azimuth of the sun seems to have the wrong sign", [-1.0, 1.0, 1.0]),
-        ("the azimuth of the sun seems to count from south", [-1.0, -1.0, 1.0]),
+        ("the azimuth of the sun seems to be counted from south", [-1.0, -1.0, 1.0]),
     ):
         far = part.source_at_infinity[:, None]
         source = np.where(far, part.source * sign, part.source)

@@ -219,13 +219,13 @@ class CommissionPlan:
         share = {name: value / total for name, value in self.seconds.items()} if total else {}
         if self.terms.floor > self.terms.goal:
             return (
-                f"error that visits do not repeat: {1e3 * self.terms.floor:.2f} mrad stay however "
-                "often a mirror is measured"
+                f"visit-to-visit error: {1e3 * self.terms.floor:.2f} mrad remain however often a "
+                "mirror is measured"
             )
         if share.get("idle", 0.0) > 1.0 - _BUSY:
             return (
                 f"the sun: targets stand idle for {100.0 * share['idle']:.0f} % of their time, "
-                "because no visit at this hour is worth its time"
+                "because no visit at those hours is worth its time"
             )
         most = max(("photographs", "search", "travel"), key=lambda name: share.get(name, 0.0))
         words = {

@@ -86,7 +86,7 @@ class JointTerms:
                 raise InputError(f"joint visits: {name} must be above 0, not {getattr(self, name)}")
         if not self.beside >= 0.0 or self.tries < 1:
             raise InputError(
-                "joint visits: the time beside the photographs must be 0 or more and the number "
+                "joint visits: the time excluding the photographs must be 0 or more and the number "
                 f"of tries 1 or more, not {self.beside} s and {self.tries}"
             )
 

@@ -79,7 +79,7 @@ class ScaledField:
             self._scale[part, :p] = scale
         self.counted = int(self.form.any(axis=(1, 2)).sum())
         if not self.counted:
-            raise InputError("campaign: no heliostat can serve its aim; check aims and stops")
+            raise InputError("campaign: no heliostat can reach its aim point; check aims and stops")
         self._armatures = [f.mechanism.armature.table for f in fleets]
 
     def __len__(self) -> int:

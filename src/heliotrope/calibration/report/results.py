@@ -102,7 +102,7 @@ class FieldParameters:
                 scaled.append(f"{self.names[p]} {scale * self.values[i, p]:+.2g} {unit}".strip())
             lines.append(
                 f"{amount(int(filled.sum()), 'heliostat')} without sightings of their own: they "
-                f"get the part that {int(self.learnt.sum())} measured ones share: "
+                f"get the part shared by the {int(self.learnt.sum())} measured heliostats: "
                 f"{', '.join(scaled)}"
             )
         if rest.any():
@@ -489,7 +489,7 @@ def _moved(
     for name in heliostats:
         if name not in rows:
             raise InputError(
-                f"heliostat {name}: {source} has no heliostat of that name; pass the file from "
+                f"heliostat {name}: {source} has no heliostat with that name; pass the file from "
                 "which the plant was read"
             )
         group, i = plant.find(name)

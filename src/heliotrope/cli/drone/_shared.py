@@ -21,8 +21,9 @@ CampaignArgument = Annotated[
     Path,
     typer.Argument(
         help=(
-            "Folder with photographs, camera.toml and commands.csv; or of a campaign: one such "
-            "folder per flight, named CLUSTER-POINT if commands.csv comes from the plan."
+            "Folder with photographs, camera.toml and commands.csv; or a campaign folder with "
+            "one such folder per flight, named CLUSTER-POINT if commands.csv comes from the "
+            "plan."
         )
     ),
 ]
@@ -34,9 +35,11 @@ CommandsOption = Annotated[
     Path | None,
     typer.Option(help="Table of commands (CSV); default: commands.csv in the folder."),
 ]
-ClusterOption = Annotated[str, typer.Option(help="Measured cluster, as named in the commands.")]
+ClusterOption = Annotated[
+    str, typer.Option(help="Cluster that was measured, as named in the commands.")
+]
 PointOption = Annotated[
-    str, typer.Option(help="Measured calibration point, as numbered in the commands.")
+    str, typer.Option(help="Calibration point that was measured, as numbered in the commands.")
 ]
 SurveyOption = Annotated[
     float, typer.Option(min=0.1, max=100_000, help="Standard deviation of surveyed positions, mm.")

@@ -42,9 +42,12 @@ def dome(
         float, typer.Option(min=1, max=100_000, help="Side length of a target's black square.")
     ] = 400.0,
     formats: Annotated[
-        str, typer.Option(help="Formats of waypoint files: some of dji,qgc,litchi, or none.")
+        str,
+        typer.Option(
+            help="Formats of waypoint files: any of dji,qgc,litchi separated by commas, or none."
+        ),
     ] = "dji,qgc,litchi",
-    aircraft: Annotated[str, typer.Option(help="Drone for DJI's files.")] = "M3E",
+    aircraft: Annotated[str, typer.Option(help="Drone model for DJI waypoint files.")] = "M3E",
     simulate: Annotated[
         bool,
         typer.Option("--simulate", help="Also render the photographs, with their ground truth."),
@@ -90,7 +93,7 @@ def dome(
 
 
 def _degrees(text: str) -> list[float]:
-    refusal = f"--elevations {text!r}: use degrees from 0 to 90, such as 35,50,65,80"
+    refusal = f"--elevations {text!r}: use angles from 0 to 90 degrees, such as 35,50,65,80"
     return list(parse_numbers(text, refusal, count=None, least=0.0, most=90.0))
 
 

@@ -55,7 +55,7 @@ def evaluate(
     rtk_mm: shared.RtkOption = 30.0,
     out: shared.OutOption = Path("out/drone"),
     report: Annotated[
-        bool, typer.Option("--report/--no-report", help="Write the page with its plots.")
+        bool, typer.Option("--report/--no-report", help="Write the report with its plots.")
     ] = True,
     processes: shared.ProcessesOption = 0,
     scheduler: calibration.SchedulerOption = None,
@@ -122,10 +122,13 @@ def _show(result: "CampaignResult", out: Path) -> None:
     for name, warning in warned[:_WARNINGS]:
         print(f"{name}: {warning}")
     if len(warned) > _WARNINGS:
-        print(f"and {len(warned) - _WARNINGS} more warnings with --json")
+        print(f"and {len(warned) - _WARNINGS} more warnings; use --json to see them all")
     for name, reason in list(result.left_out().items())[:_WARNINGS]:
         print(f"left out: {name}: {reason}")
-    print(f"written to {out}: orientations, reflections, sightings, and the report unless declined")
+    print(
+        f"written to {out}: orientations, reflections, sightings and, without --no-report, the "
+        "report"
+    )
 
 
 def _show_orientations(result: "CampaignResult", out: Path) -> None:
@@ -149,4 +152,4 @@ def _show_reference(compared: "Sequence[Compared]", out: Path) -> None:
     table = offset_table(compared)
     body = [*table["rows"][:_ORIENTATIONS], *table["rows"][max(_ORIENTATIONS, len(compared)) :]]
     print_table(table["head"], body, "Orientation minus reference, mrad")
-    print(f"written to {out}: reference.csv, and reference.html unless declined")
+    print(f"written to {out}: reference.csv and, without --no-report, reference.html")

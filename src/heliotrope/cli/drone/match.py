@@ -47,7 +47,7 @@ def match(
     for picture, count in zip(sheets.pictures, sheets.outlines, strict=True):
         print(f"{picture}: {count} outlines")
     print(
-        f"In {sheets.table} name three or more mirrors in each photograph, far apart; rows "
-        "without a heliostat are ignored."
+        f"In {sheets.table}, enter the heliostat names of three or more mirrors in each "
+        "photograph, far apart from each other; rows without a name are ignored."
     )
-    print(f"Then: heliotrope drone evaluate {folder} --field {field} --matches {sheets.table}")
+    print(f"Then run: heliotrope drone evaluate {folder} --field {field} --matches {sheets.table}")

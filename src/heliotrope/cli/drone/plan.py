@@ -33,7 +33,10 @@ def plan(
         str, typer.Option(help="auto, or jacks, malan8, guo6, khalsa8, full.")
     ] = "auto",
     criterion: Annotated[
-        Literal["d", "v"], typer.Option(help="d: most information; v: smallest beam error.")
+        Literal["d", "v"],
+        typer.Option(
+            help=("What points are chosen for: d, most information; v, smallest beam error.")
+        ),
     ] = "d",
     distance: Annotated[
         float, typer.Option(min=1, max=10_000, help="Distance of the drone from a cluster, m.")
@@ -92,7 +95,10 @@ def plan(
         ),
     ] = "20,85",
     airspace: Annotated[
-        Path | None, typer.Option(help="JSON with keep-outs, fence, heights, home.")
+        Path | None,
+        typer.Option(
+            help="JSON file with keep-out volumes, geofence, height limits and take-off place."
+        ),
     ] = None,
     tower: Annotated[
         bool,
@@ -128,9 +134,12 @@ def plan(
         ),
     ] = 2.0,
     formats: Annotated[
-        str, typer.Option(help="Formats of waypoint files: some of dji,qgc,litchi, or none.")
+        str,
+        typer.Option(
+            help="Formats of waypoint files: any of dji,qgc,litchi separated by commas, or none."
+        ),
     ] = "dji,qgc,litchi",
-    aircraft: Annotated[str, typer.Option(help="Drone for DJI's files.")] = "M3E",
+    aircraft: Annotated[str, typer.Option(help="Drone model for DJI waypoint files.")] = "M3E",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Plan a drone campaign: clusters, hover patterns, heliostat commands, sorties."""
@@ -200,7 +209,7 @@ def _selection(
 
     from heliotrope.airborne.plan.calibration_points import PointSelection
 
-    refusal = f"--elevations {elevations!r}: use two angles from 0 to 90 degrees"
+    refusal = f"--elevations {elevations!r}: use two angles from 0 to 90 degrees, such as 35,80"
     asked = parse_numbers(elevations, refusal, count=2, least=0.0, most=90.0)
     low, high = np.radians(asked).tolist()
     return PointSelection(
@@ -233,12 +242,12 @@ def _print(s: dict[str, Any]) -> None:
     rows = [
         ["heliostats", f"{s['heliostats']:,}"],
         ["clusters", f"{s['clusters']:,}"],
-        ["radius of the largest, m", f"{s['cluster_radius_m'][1]:.1f}"],
-        ["calibration points of each", f"{s['calibration_points']}"],
+        ["largest cluster radius, m", f"{s['cluster_radius_m'][1]:.1f}"],
+        ["points per heliostat", f"{s['calibration_points']}"],
         ["orientations", f"{s['orientations']:,}"],
         ["hover points of a pattern", f"{patterns[0]} to {patterns[1]}"],
         ["their spacing, m", f"{spaces[0]:.2f} to {spaces[1]:.2f}"],
-        ["reflections on a facet", f"{s['samples_of_a_facet']:.1f}"],
+        ["reflections per facet", f"{s['samples_of_a_facet']:.1f}"],
         ["visible on the median mirror", f"{s['reflections_of_a_mirror'][1]:.1f}"],
         ["photographs", f"{s['photographs']:,}"],
         ["drones", f"{s['drones']}"],

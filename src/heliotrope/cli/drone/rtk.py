@@ -27,7 +27,9 @@ def rtk(
     targets: Annotated[
         bool,
         typer.Option(
-            "--targets", help="Use coded targets (`drone dome`) instead of mirrors; no commands."
+            "--targets",
+            help="Use the coded targets of `drone dome` instead of mirrors; commands.csv is not "
+            "needed.",
         ),
     ] = False,
     survey_mm: shared.SurveyOption = 10.0,
@@ -116,7 +118,15 @@ def _show(check: "RtkCheck") -> None:
         for k, axis in enumerate(_AXES)
     ]
     print_table(
-        ["axis", "common offset", "± of it", "σ of both", "of photogrammetry", "of RTK", "95 %"],
+        [
+            "axis",
+            "common offset",
+            "σ of the offset",
+            "σ of one difference",
+            "σ of photogrammetry",
+            "σ of RTK",
+            "95 %",
+        ],
         rows,
         f"RTK minus photogrammetry, {len(check.names)} photographs, mm",
     )

@@ -31,7 +31,9 @@ def simulate(
     ] = 80,
     hover: Annotated[
         str,
-        typer.Option(help="Centre of the pattern, E,N,U in m; default: on the side of the tower."),
+        typer.Option(
+            help="Centre of the hover pattern, E,N,U in m; default: on the side towards the tower."
+        ),
     ] = "",
     distance: Annotated[
         float, typer.Option(min=5, max=10_000, help="Distance from the mirrors, m.")
@@ -48,15 +50,21 @@ def simulate(
     ] = "4000x3000",
     focal_px: Annotated[
         float,
-        typer.Option(min=0, max=1e6, help="Focal length, pixels; 0: three quarters of the width."),
+        typer.Option(
+            min=0,
+            max=1e6,
+            help="Focal length of the camera, pixels; 0: three quarters of the width.",
+        ),
     ] = 0.0,
     slope_mrad: Annotated[
-        float, typer.Option(min=0, max=100, help="RMS of slope deviations.")
+        float, typer.Option(min=0, max=100, help="RMS slope deviation of the mirrors.")
     ] = 0.8,
     rtk_mm: Annotated[
-        float, typer.Option(min=0, max=100_000, help="RTK error of each position.")
+        float, typer.Option(min=0, max=100_000, help="Random RTK error of each position.")
     ] = 8.0,
-    offset_mm: Annotated[str, typer.Option(help="Common RTK offset, E,N,U.")] = "0,0,0",
+    offset_mm: Annotated[
+        str, typer.Option(help="RTK offset common to all positions, E,N,U.")
+    ] = "0,0,0",
     survey_mm: Annotated[
         float, typer.Option(min=0, max=100_000, help="Survey error of the heliostats' positions.")
     ] = 10.0,

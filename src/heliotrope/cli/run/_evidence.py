@@ -48,7 +48,7 @@ class Evidence:
             raise InputError("run: --syslog-authority works only with --syslog tls://host")
         _ = self.receiver
         if self.heads is not None and not self.heads.is_dir():
-            raise InputError(f"run: --heads {self.heads}: no such folder; create it")
+            raise InputError(f"run: --heads {self.heads}: the folder does not exist; create it")
         if not _LEAST <= self.hours <= _MOST:
             raise InputError(
                 f"run: --heads-every must be between {_LEAST:g} and {_MOST:g} h, not "

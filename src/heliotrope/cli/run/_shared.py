@@ -71,8 +71,8 @@ _PLANNED = 20
 _WORDS = {
     "UNCONFIGURED": "without parameters",
     "STOWED": "in stow",
-    "STOWING": "go to stow",
-    "APPROACHING": "move to their aims",
+    "STOWING": "going to stow",
+    "APPROACHING": "moving to their aims",
     "IDLE": "at standby",
     "DEFOCUSED": "defocused",
     "LOCKED": "locked",
@@ -346,7 +346,7 @@ def first_password(password: str, folder: Path) -> str:
     the password is then written to a file that only its owner may read.
     """
     if sys.stdout.isatty():
-        return f"password {password} (shown only now)"
+        return f"password {password} (shown only once)"
     path = folder / FIRST_FILE
     path.unlink(missing_ok=True)
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
@@ -467,7 +467,7 @@ def _on_the_way(live: PlantAssembly) -> str:
     counts = ", ".join(f"{count:,} {state.lower()}" for state, count in by_state.items())
     # To ten seconds: the paths round volumes are longer than the axes' turns.
     known = math.isfinite(seconds)
-    about = f"about {max(1, math.ceil(0.1 * seconds)) * 10} s" if known else "of unknown position"
+    about = f"about {max(1, math.ceil(0.1 * seconds)) * 10} s" if known else "time unknown"
     return f"stowing {sum(by_state.values()):,} heliostats ({counts}), {about}"
 
 
@@ -477,7 +477,7 @@ def line(live: PlantAssembly) -> str:
     counts = dict(summary.states)
     tracking = counts.pop("TRACKING", 0)
     others = sorted(counts.items(), key=lambda one: -one[1])
-    field = [f"{tracking:,} of {summary.heliostats:,} track"]
+    field = [f"{tracking:,} of {summary.heliostats:,} tracking"]
     field += [f"{count:,} {_WORDS[state]}" for state, count in others]
     parts = ["EMERGENCY"] if summary.emergency else []
     parts += [", ".join(field), f"{_calibrated_today(live):,} calibrated today{_error(work)}"]

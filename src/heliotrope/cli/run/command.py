@@ -97,9 +97,9 @@ def run(
         Begin,
         typer.Option(
             "--from",
-            help="second-day: the field tracks, and part of it was measured the day "
-            "before; new: no heliostat has been measured; stow: as second-day, but "
-            "beginning in the morning with the field at stow.",
+            help="second-day: the field tracks, and part of it was measured the day before; new: "
+            "no heliostat has been measured; stow: as second-day, but starting in the "
+            "morning with the field at stow.",
             rich_help_panel=_TWIN,
         ),
     ] = Begin.SECOND_DAY,
@@ -120,14 +120,14 @@ def run(
         ),
     ] = False,
     check: Annotated[
-        bool, typer.Option("--check", help="Only check the files.", rich_help_panel=_REAL)
+        bool, typer.Option("--check", help="Check the files, then exit.", rich_help_panel=_REAL)
     ] = False,
     idle: Annotated[
         bool | None,
         typer.Option(
             "--idle/--automatic",
-            help="Wait for an operator, or start automatic control at once; default: --idle for a "
-            "real plant, --automatic in simulation.",
+            help="Wait for an operator, or start automatic control immediately; default: --idle "
+            "for a real plant, --automatic in simulation.",
             rich_help_panel=_WORK,
         ),
     ] = None,
@@ -143,7 +143,7 @@ def run(
     every: Annotated[
         float,
         typer.Option(
-            min=0.1, max=86_400, help="Interval between printed lines, s.", rich_help_panel=_WORK
+            min=0.1, max=86_400, help="Interval between status lines, s.", rich_help_panel=_WORK
         ),
     ] = 10.0,
     stow_rate: Annotated[
@@ -151,8 +151,9 @@ def run(
         typer.Option(
             min=0,
             max=1e6,
-            help="Heliostats per second that an ordinary STOW of many sends to stow; 0: "
-            "all at once. Emergencies always send all at once.",
+            help="Rate at which an ordinary STOW of many heliostats sends them to stow, "
+            "heliostats per second; 0: all at once. In an emergency all are always sent at "
+            "once.",
             rich_help_panel=_WORK,
         ),
     ] = 200.0,
@@ -231,14 +232,15 @@ def run(
         typer.Option(
             min=3,
             max=100,
-            help="Failed sign-ins per hour for one name at one address; more attempts must wait.",
+            help="Failed sign-ins allowed per hour for one name from one address; further "
+            "attempts must wait.",
             rich_help_panel=_CONSOLE,
         ),
     ] = 12,
     notice: Annotated[
         Path | None,
         typer.Option(
-            help="File with a text shown before sign-in.",
+            help="File with a notice that is shown before sign-in.",
             rich_help_panel=_CONSOLE,
         ),
     ] = None,
@@ -247,12 +249,17 @@ def run(
         typer.Option(
             min=0,
             max=65_535,
-            help="Port for EMERGENCY alone; default: the one after --port.",
+            help="Separate port for EMERGENCY; default: the one after --port.",
             rich_help_panel=_CONSOLE,
         ),
     ] = None,
     no_console: Annotated[
-        bool, typer.Option("--no-console", help="Only print lines.", rich_help_panel=_CONSOLE)
+        bool,
+        typer.Option(
+            "--no-console",
+            help="Run without the console; only print status lines.",
+            rich_help_panel=_CONSOLE,
+        ),
     ] = False,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Do not open a browser.", rich_help_panel=_CONSOLE)
@@ -384,7 +391,7 @@ def run(
             return
         assert clusters is not None
         if field is None:
-            raise InputError("run: --clusters needs a plant file; name it before the options")
+            raise InputError("run: --clusters needs a plant file; put it before the options")
         _only_real(speed=speed != 1.0, start=start != "morning", seed=bool(seed))
         folder = field if field.is_dir() else field.parent
         choice = PlantChoice(folder, clusters, idle is not False, configure, check, file=field)
@@ -416,6 +423,6 @@ def _only_real(**simulated: bool) -> None:
     if options:
         raise InputError(
             f"run: {options}: only available in simulation, because real clusters track the "
-            "actual sun by their own clocks; drop the option, or drop --clusters to simulate this "
-            "plant"
+            "actual sun by their own clocks; leave out the option, or leave out --clusters to "
+            "simulate this plant"
         )

@@ -186,7 +186,10 @@ def _check(
     )
     bare = [name for name, group in design.groups.items() if not group.machines]
     if bare:
-        print(f"--configure needs a machine table, which is missing in group {', '.join(bare)}")
+        print(
+            "--configure needs a machine table; add it to the plant file for group "
+            f"{', '.join(bare)}"
+        )
 
 
 @dataclass(frozen=True)
@@ -351,7 +354,10 @@ async def _run(
             live.aim_as_designed()
         real = outside.reader is None
         if real and live.plant.sentinel.table.unwatched:
-            print(f"no readings for: {', '.join(live.plant.sentinel.table.unwatched)}", flush=True)
+            print(
+                f"no readings for: {', '.join(live.plant.sentinel.table.unwatched)}",
+                flush=True,
+            )
         papers = _papers(outside, shown)
         for local in outside.local:
             file = local.installation.bus_key_file

@@ -20,7 +20,7 @@ export function waitingView(one, buttons = true) {
   const refuse = () => askAnd(t("Refuse the change of {name}?", { name: one.heliostat }), [{ name: "reason", label: t("Reason") }], t("Refuse"), (v) => api("POST", `${path}/refuse`, v), t("refuse the change"));
   return h("section", { className: "hx-why off hx-waiting" }, h("p", {}, h("b", {}, t("{name}: new parameters wait for a second engineer", { name: one.heliostat }))), h("p", {}, (one.version ? `${t("version {n} again", { n: one.version })}: ` : "") + values),
     h("p", { className: "hx-hint" }, t("Asked for by {author} at {at}: {reason}. It ends by itself at {until}.", { author: one.author, at: moment(one.at), reason: one.reason, until: moment(one.until) }),
-      one.beam_rms === null ? "" : ` ${t("The beam moves by {rms} mm RMS at its aim, at most {most} mm.", { rms: number(1e3 * one.beam_rms, 1), most: number(1e3 * one.beam_most, 1) })}`),
+      one.beam_rms === null ? "" : ` ${t("The beam moves by {rms} mm RMS at its aim point, at most {most} mm.", { rms: number(1e3 * one.beam_rms, 1), most: number(1e3 * one.beam_most, 1) })}`),
     buttons && me.role === "engineer" ? h("div", { className: "hx-row" }, mine ? does(t("Withdraw"), () => act(() => api("DELETE", path), t("withdraw the change")))
       : [does(t("Approve"), () => act(() => api("POST", `${path}/approve`), t("approve the change")), "main"), does(t("Refuse…"), refuse)]) : "");
 }

@@ -40,9 +40,11 @@ def build_aims(table: AimsTable | None, folder: Path) -> AimSettings:
     }
     if sum(limits.values()) > 1:
         both = " and ".join(key for key, present in limits.items() if present)
-        raise InputError(f"aims: {both} exclude each other; keep one of them")
+        raise InputError(f"aims: {both} cannot be used together; keep one of them")
     if bool(table.limit_table) != bool(table.limit_panels):
-        raise InputError("aims: limit_table and limit_panels belong together; set both or neither")
+        raise InputError(
+            "aims: limit_table and limit_panels must be used together; set both or neither"
+        )
     limit = None
     if table.limit_kw_m2 is not None:
         limit = FluxLimit(1e3 * table.limit_kw_m2, table.margin)

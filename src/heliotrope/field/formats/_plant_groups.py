@@ -433,8 +433,8 @@ class _Reader:
             raise self.fail(
                 f"the {joints[axis]} of heliostat {self.table.name[self.rows[row]]} needs "
                 f"{time[row, axis]:.0f} s to turn away by {np.degrees(defocus[row, axis]):.1f}°, "
-                f"and has {LONGEST_DEFOCUS:.0f} s after the loss of its cluster has been noticed; "
-                "lower defocus_spread or the angles, or raise the rate",
+                f"but has only {LONGEST_DEFOCUS:.0f} s after the loss of its cluster is "
+                "detected; lower defocus_spread or the angles, or raise the rate",
                 "machine",
             )
 

@@ -105,7 +105,9 @@ class ReceiverTable(StrictTable):
     center_m: Vector = Field(description="Of a cavity: the middle of its aperture.")
     normal: Vector
     width_m: Positive | None = Field(
-        None, description="Of the aperture, or diameter; default only of a mesh: its extent."
+        None,
+        description="Of the aperture, or the diameter; may be omitted only for a mesh, whose "
+        "extent is then used.",
     )
     height_m: Positive | None = None
     corners_m: Annotated[list[Vector], Field(min_length=4, max_length=4)] | None = None
@@ -117,11 +119,11 @@ class ReceiverTable(StrictTable):
     mesh: str = Field(
         "",
         description="File beside this one (.obj, or binary .stl) with the surface of a mesh, or "
-        "the inner surface of a cavity: m about center_m, to the right and up as seen from the "
-        "front, and out of it.",
+        "the inner surface of a cavity: coordinates in m relative to center_m: right and up as "
+        "seen from the front, and outwards.",
     )
     nominal_power_mw: Positive | None = Field(
-        None, description="Power on it to which readings of its flux refer."
+        None, description="Power on the receiver that its flux readings take as nominal."
     )
 
 
@@ -131,7 +133,7 @@ class TowerTable(StrictTable):
     east_m: Number
     north_m: Number
     radius_m: Positive
-    bottom_m: Number = Field(-1e4, description="Height of its foot; default: below any ground.")
+    bottom_m: Number = Field(-1e4, description="Height of its base; default: far below the ground.")
     top_m: Number
 
 
@@ -314,8 +316,8 @@ class MachineTable(StrictTable):
     defocus_spread: Annotated[float, Field(ge=0.0, le=4.0, allow_inf_nan=False)] = Field(
         1.0,
         description=(
-            "Each heliostat turns by up to this many times more, so that the beams spread; 0: all "
-            "by the same angles."
+            "Each heliostat turns further, by up to this multiple of the angles, so that the "
+            "beams spread; 0: all by the same angles."
         ),
     )
     stow_lights: bool = Field(
@@ -331,7 +333,7 @@ class MachineTable(StrictTable):
         ),
     )
     standby_m: Vector | None = Field(
-        None, description="ENU; if omitted, the local controller keeps its present point."
+        None, description="ENU; if omitted, the local controller keeps its current point."
     )
     leaves_stow_first: str | None = Field(
         None, description="Joint that moves first when leaving stow; default: the first driven."
@@ -342,7 +344,7 @@ class MachineTable(StrictTable):
         "the local controller finds its own.",
     )
     stepping: SteppingTable | None = Field(
-        None, description="If omitted, the local controller keeps its present values."
+        None, description="If omitted, the local controller keeps its current values."
     )
 
 
@@ -380,18 +382,18 @@ class MirrorTable(StrictTable):
     )
     canting: Literal["none", "slant", "focal", "off_axis"] | None = Field(
         None,
-        description="Of equal facets. slant (default): on axis, each mirror for its distance to "
-        "its aim. focal: for canting_focal_m. off_axis: for canting_time.",
+        description="Of equal facets. slant (default): on-axis, for each mirror's distance to its "
+        "aim point. focal: on-axis, for canting_focal_m. off_axis: for canting_time.",
     )
     canting_focal_m: Length | None = Field(None, description="Focal length of on-axis canting.")
     canting_time: str | None = Field(
-        None, description="Time of off-axis canting, ISO 8601 with its zone."
+        None, description="Time of off-axis canting, ISO 8601 with a time zone."
     )
     canting_sun: Vector | None = Field(
         None, description="Instead of the time: vector to the sun, ENU."
     )
     facet: list[FacetTable] = Field(
-        default_factory=list, description="Single facets, instead of equal ones."
+        default_factory=list, description="Individual facets, instead of equal ones."
     )
     focal_m: Length | None = Field(
         None,
@@ -399,7 +401,7 @@ class MirrorTable(StrictTable):
         "1e9 or more: flat. Default: the distance to the aim.",
     )
     slope_error_mrad: SlopeError | None = Field(
-        None, description="Standard deviation of the surface's normal per axis."
+        None, description="Standard deviation of the surface normal per axis."
     )
     reflectivity: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] | None = Field(
         None, description="Of the clean mirror."
@@ -444,7 +446,7 @@ class GroupTable(StrictTable):
     chain: ChainTable | None = None
     drives: dict[str, AnyDrive] = Field(default_factory=dict)
     machine: MachineTable | None = Field(
-        None, description="Motor limits and resting places; needed to run and to configure."
+        None, description="Motor limits and rest positions; needed to run and to configure."
     )
     mirror: MirrorTable | None = Field(
         None, description="Facets, curvature and errors of the mirrors."
@@ -547,7 +549,9 @@ class AimsTable(StrictTable):
     limit_panels: str = Field(
         "", description="Panels with the state of the fluid: a table (CSV) beside this one."
     )
-    margin: Number = Field(0.05, description="Share kept for the model's own error; 0 to 0.5.")
+    margin: Number = Field(
+        0.05, description="Fraction of the limit reserved for model error; 0 to 0.5."
+    )
     probability: Number = Field(
         AimSettings.probability,
         description="Probability that the limit holds everywhere; 0.5 to 0.9999.",
@@ -562,22 +566,24 @@ class AimsTable(StrictTable):
     )
     ramp_kw_m2_min: Number = Field(
         0.0,
-        description="Greatest rise of the flux in a cell while the receiver is heated after "
-        "standby or a cloud, kW/m² a minute; 0: no ramp.",
+        description="Fastest increase of the flux in a cell while the receiver is heated after "
+        "standby or a cloud, kW/m² per minute; 0: no ramp.",
     )
     moves_per_minute: Number = Field(
-        AimSettings.moves, description="Number of tracking heliostats given a new aim; 1 to 6000."
+        AimSettings.moves,
+        description="Maximum number of tracking heliostats given a new aim per minute; 1 to 6000.",
     )
     together: int = Field(
-        AimSettings.together, description="Number of heliostats moving at the same time; 1 to 1000."
+        AimSettings.together,
+        description="Maximum number of heliostats moving to a new aim at the same time; 1 to 1000.",
     )
     every_s: Number = Field(
         AimSettings.every, description="Time between two computations; 5 to 600."
     )
     deadline_s: Number = Field(
         AimSettings.deadline,
-        description="Age of the last good aims at which an alarm is raised; after five times that "
-        "the field goes to the safe spread. Twice every_s to 3600.",
+        description="Age of the last good aims at which an alarm is raised; at five times this "
+        "age the field goes to the safe spread. From twice every_s to 3600.",
     )
 
 
@@ -588,7 +594,9 @@ class PlantDocument(StrictTable):
     version: Literal[1]
     plant: PlantNameTable
     site: PlantSiteTable
-    heliostats: str = Field(description="Table of the heliostats (CSV or Parquet), beside it.")
+    heliostats: str = Field(
+        description="Table of the heliostats (CSV or Parquet), beside this file."
+    )
     groups: dict[str, GroupTable] = Field(min_length=1)
     targets: list[TargetTable] = Field(default_factory=list)
     receivers: list[ReceiverTable] = Field(default_factory=list)

@@ -22,7 +22,7 @@ from heliotrope.geometry import enu_to_geodetic, geodetic_to_enu
 if TYPE_CHECKING:
     import h5py
 
-_WHAT = "a scenario that ARTIST has made"
+_WHAT = "an ARTIST scenario"
 #: ARTIST's names of the deviations, by PAINT's names; PAINT's ``joint_tilt_e_2`` tilts the second
 #: joint.
 _DEVIATIONS = {
@@ -79,8 +79,8 @@ def write_scenario(
             for name, group in heliostats.items():
                 if name not in known:
                     raise InputError(
-                        f"heliostat {name}: {file} has {len(known)} heliostats, but none of that "
-                        "name; create the scenario with this heliostat"
+                        f"heliostat {name}: {file} has {len(known)} heliostats, but none with "
+                        "that name; create the scenario with this heliostat"
                     )
                 mechanism = written(group, name)
                 foot = enu_to_geodetic(mechanism.position, origin)

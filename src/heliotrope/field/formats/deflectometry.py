@@ -28,7 +28,7 @@ SUFFIX = ".h5"
 _CELLS, _POINTS = 64, 4
 # Minimum fraction of the points that must lie on their facet; the rest may be at its rim.
 _ON_FACET = 0.5
-_WHAT = "a deflectometry file in PAINT's form (.h5)"
+_WHAT = "a deflectometry file in PAINT's format (.h5)"
 
 
 def find_deflectometry(folder: Path, name: str) -> Path | None:

@@ -373,7 +373,7 @@ class _Run:
             return self._document(link)
         except NotFoundError:
             raise FetchError(
-                f"heliostat {link.heliostat}: {self.base} has no heliostat of this name"
+                f"heliostat {link.heliostat}: {self.base} has no heliostat with this name"
                 + self._suggestion(link.heliostat)
             ) from None
 
@@ -384,9 +384,9 @@ class _Run:
             root = self._document(_Link("", "", f"{self.base}/{plant}-catalog-stac.json"))
             matches = [_CATALOGUE.search(url) for url in root.hrefs("child")]
         except FetchError:
-            return "; look at its catalogue"
+            return "; see its catalogue"
         close = get_close_matches(name, [match[1] for match in matches if match])
-        return f"; did you mean {', '.join(close)}?" if close else "; look at its catalogue"
+        return f"; did you mean {', '.join(close)}?" if close else "; see its catalogue"
 
     def _document(self, link: _Link) -> _Document:
         url = self._address(link.url)
@@ -496,5 +496,5 @@ def _distinct(jobs: Iterable[RemoteFile]) -> list[RemoteFile]:
     for job in jobs:
         first = distinct.setdefault(job.path, job)
         if first.url != job.url:
-            raise FetchError(f"{job.url}: would be stored where {first.url} is; refused")
+            raise FetchError(f"{job.url}: would overwrite the file from {first.url}; refused")
     return list(distinct.values())

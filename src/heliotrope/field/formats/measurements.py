@@ -157,7 +157,7 @@ def _keep_good(
         (~np.isfinite(counts).all(axis=1), "a motor position is missing or not a number"),
         (~np.isfinite(azimuth) | ~np.isfinite(elevation), "the sun's angles are missing"),
         (~((elevation > -5.0) & (elevation <= 90.0)), "the sun's elevation is not above −5°"),
-        (time >= END_OF_TIMES, "the year is out of range: correct the time"),
+        (time >= END_OF_TIMES, "the year is out of range; correct the time"),
         (~np.isfinite(enu).all(axis=1), f"there is no {centroid.upper()} centroid"),
         (np.linalg.norm(enu, axis=1) > 5e3, "the centroid lies more than 5 km from the plant"),
     ]

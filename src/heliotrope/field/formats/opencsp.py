@@ -160,9 +160,11 @@ def _location(rows: Rows) -> FloatArray:
 
 
 def _count(rows: Rows, column: str) -> FloatArray:
-    values = rows.numbers(column, "a number of pieces")
+    values = rows.numbers(column, "a number of facets, rows or columns")
     invalid = ~((values >= 1) & (values == np.floor(values)) & (values <= 1e6))
-    rows.check(column, invalid & np.isfinite(values), values, " is not a number of pieces")
+    rows.check(
+        column, invalid & np.isfinite(values), values, " is not a whole number from 1 to 1,000,000"
+    )
     return values
 
 

@@ -133,8 +133,8 @@ def _of_solarpilot(
     mirror = solarpilot.Template(DEFAULT_MIRROR, DEFAULT_MIRROR)
     plant = solarpilot.to_plant(layout, site, dict.fromkeys(layout.template.tolist(), mirror))
     size = (
-        f"the layout specifies none: {DEFAULT_MIRROR} m × {DEFAULT_MIRROR} m with the mirror in "
-        "its pivot is SolarPILOT's default; pass templates"
+        f"the layout specifies none, so SolarPILOT's default is used: {DEFAULT_MIRROR} m × "
+        f"{DEFAULT_MIRROR} m, with the pivot in the mirror; pass templates to change it"
     )
     return plant.with_notes({"size of the mirrors": size})
 

@@ -187,7 +187,7 @@ def restore(path: str | Path, version: str, *, note: str = "", now: datetime | N
         raise UnknownNameError("stored version", version, known)
     old = _Files(_versions(place) / version / place.name)
     # The present file may be unreadable.
-    kept = _keep(place, old.table, f"version {version} was brought back", note, now)
+    kept = _keep(place, old.table, f"version {version} was restored", note, now)
     _copy(old.place.parent, place.parent, old.table)
     _copy(old.place.parent, place.parent, place.name)
     return kept
@@ -213,7 +213,9 @@ class _Files:
         self.table = PurePath(str(read_toml(place, "a plant file")["heliostats"]))
         if self.table.is_absolute() or ".." in self.table.parts:
             raise FormatError(
-                place, f"{self.table} lies elsewhere; keep it beside the plant file", "heliostats"
+                place,
+                f"{self.table} is in another folder; keep it beside the plant file",
+                "heliostats",
             )
         self.cells: Any = pd.DataFrame(read_columns(place.parent / self.table).columns)
 
@@ -290,7 +292,7 @@ class _Files:
         if not prior or abs(value) <= _STRANGE * prior:
             return []
         times = f"{value:g} is {abs(value) / prior:.0f} times the usual installation error"
-        return [f"{who}: {column} {times} (σ {prior:g}); is it in another unit?"]
+        return [f"{who}: {column} {times} (σ {prior:g}); check the unit"]
 
     def _rename(self, old: str, new: str) -> None:
         for camera in self.document.get("cameras", ()):

@@ -408,8 +408,8 @@ def _placing(plant: Plant, surface: Target | Receiver) -> list[str]:
     if behind.any() and getattr(surface, "kind", "planar") == "planar":
         example = plant.names[int(np.flatnonzero(behind)[0])]
         texts.append(
-            f"{what}: {int(behind.sum())} of {len(plant)} heliostats stand behind its plane "
-            f"and cannot light it (for example {example})"
+            f"{what}: {int(behind.sum())} of {len(plant)} heliostats are behind its plane and "
+            f"cannot illuminate it (for example {example})"
         )
     nearest = int(np.argmin(np.linalg.norm(lines, axis=1)))
     size = np.concatenate([np.hypot(g.width, g.height) for g in plant.groups.values()])
@@ -457,7 +457,7 @@ def _crowding(plant: Plant) -> list[str]:
     i, j = pairs[close][int(np.argmin(apart[close]))]
     text = (
         f"{int(close.sum())} pairs of mirrors can touch: the nearest, {plant.names[i]} and "
-        f"{plant.names[j]}, stand {apart[close].min():.2f} m apart with diagonals of "
+        f"{plant.names[j]}, are {apart[close].min():.2f} m apart, with diagonals of "
         f"{size[i]:.2f} m"
     )
     return [text]

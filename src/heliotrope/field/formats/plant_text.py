@@ -211,7 +211,7 @@ def _outside(document: Mapping[str, Any], allowed: set[str], text: str) -> Itera
         away = part.is_absolute() or ".." in part.parts
         if away and (name not in allowed or name == document.get("heliostats")):
             line = next((n for n, row in enumerate(text.split("\n"), 1) if name in row), 0)
-            said = f"{name[:100]} lies elsewhere; keep the file beside the plant file"
+            said = f"{name[:100]} is in another folder; keep the file beside the plant file"
             yield TextFinding("error", said, line)
 
 

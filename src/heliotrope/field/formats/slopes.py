@@ -62,7 +62,7 @@ def checked_slopes(file: Path, slope: FloatArray, facets: int) -> FloatArray:
         raise FormatError(
             file,
             f"a slope deviation of {1e3 * largest:.0f} mrad is above "
-            f"{1e3 * LARGEST:.0f} mrad; is it in another unit?",
+            f"{1e3 * LARGEST:.0f} mrad; check the unit",
         )
     for k in range(facets):
         missing = float(np.mean(~np.isfinite(slope[k]).all(axis=-1)))

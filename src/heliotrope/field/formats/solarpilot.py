@@ -217,9 +217,9 @@ def _by_position(
     if width not in WIDTHS:
         raise FormatError(
             file,
-            f"{width} columns; a layout has 14 (template, enabled, in layout, location, "
-            "focus, cant, aim), 12 (without the flags), 6 or 4 (up to the location), or a header; "
-            "decimals take a point",
+            f"{width} columns; a layout has 14 (template, enabled, in layout, location, focus, "
+            "cant, aim), 12 (without the flags), 6 or 4 (up to the location), or a header; "
+            "write decimals with a point",
             place,
         )
     kept = [k for k in range(14) if WIDTHS[width] or k not in {1, 2}][:width]
@@ -345,7 +345,7 @@ def _group(rows: Rows, columns: dict[str, str], group: tuple[str, ...]) -> Float
     missing = np.isnan(values)
     for i in np.flatnonzero(missing.any(axis=1) & ~missing.all(axis=1)):
         what = f"all {len(group)} columns of {group[0].split()[0]} are numbers or NULL"
-        rows.refuse(i, names[int(np.argmax(missing[i]))], f"NULL beside numbers; {what}")
+        rows.refuse(i, names[int(np.argmax(missing[i]))], f"NULL mixed with numbers; {what}")
     return values
 
 

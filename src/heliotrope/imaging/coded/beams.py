@@ -9,13 +9,13 @@ from heliotrope.geometry import FloatArray
 class Verdict(Enum):
     """The result of a stack for one heliostat."""
 
-    PROVEN = "follows its own code at its expected place"
+    PROVEN = "follows its own code at its expected position"
     STUCK = "its light does not move"
-    EXCHANGED = "the beam at its expected place follows another heliostat's code"
-    ELSEWHERE = "its beam is far from the expected place"
+    EXCHANGED = "the beam at its expected position follows another heliostat's code"
+    ELSEWHERE = "its beam is far from its expected position"
     JOINED = "its beam merges with other light"
     FAINT = "no light follows its code"
-    CLOUD = "too few photographs in the sun"
+    CLOUD = "too few photographs in sunlight"
 
 
 @dataclass(frozen=True)

@@ -169,5 +169,6 @@ def _check(stack: Stack, moves: FloatArray, expected: Sequence[ExpectedBeam]) ->
         first, other = (expected[int(i)].heliostat for i in near[0])
         raise InputError(
             f"separation: {first} and {other} have the same code, {away[tuple(near[0])]:.1f} "
-            f"standard deviations apart; place them {APART:g} apart, or assign different codes"
+            f"standard deviations apart; move their beams at least {APART:g} standard deviations "
+            "apart, or assign different codes"
         )

@@ -250,7 +250,7 @@ class EmptyTarget:
         names = tuple(target.name for target in picture.face.targets)
         if self.targets and set(self.targets) != set(names):
             raise InputError(
-                f"the model is of {', '.join(self.targets)}, but the frame shows "
+                f"the model is for {', '.join(self.targets)}, but the frame shows "
                 f"{', '.join(names)}; use the model of this target"
             )
         if picture.shape != self.reflectance.shape:
@@ -519,7 +519,7 @@ def _grid(picture: Rectified, pattern: Image, orders: tuple[int, int]) -> _Grid:
     count = int(paint.sum())
     if count < 4 * table.shape[-1]:
         raise InputError(
-            f"only {count} places of bare paint are visible, too few for a background: the target "
+            f"bare paint is visible in only {count} places, too few for a background: the target "
             "is too small in the frame or covered"
         )
     level = float(np.median(soft[paint]))

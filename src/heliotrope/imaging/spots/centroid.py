@@ -106,7 +106,7 @@ def with_centroid(
     moved = place(picture, replace(placed.spot, centroid=centroid, covariance=covariance))
     if moved.target is None or moved.target.name != target.name:
         raise InputError(
-            f"own centroid: place {plane.tolist()} m is not on target {target.name}, "
+            f"custom centroid: position {plane.tolist()} m is not on target {target.name}, "
             f"{target.width:.4g} × {target.height:.4g} m; return metres right of and above its "
             "centre"
         )
@@ -117,19 +117,19 @@ def _checked(result: object, target: Target) -> tuple[FloatArray, FloatArray]:
     """Return position and covariance as arrays."""
     if not (isinstance(result, tuple | list) and len(result) == 2):
         raise InputError(
-            f"own centroid: it returned {kind_of(result)} for target {target.name}; return a "
-            "place (2,) in metres and its covariance (2, 2) in m²"
+            f"custom centroid: it returned {kind_of(result)} for target {target.name}; return a "
+            "position (2,) in metres and its covariance (2, 2) in m²"
         )
     try:
         plane, covariance = as_float(result[0]), as_float(result[1])
     except (TypeError, ValueError):
         raise InputError(
-            f"own centroid: place or covariance on target {target.name} is not an array of "
-            "numbers; return a place (2,) in metres and its covariance (2, 2) in m²"
+            f"custom centroid: position or covariance on target {target.name} is not an array of "
+            "numbers; return a position (2,) in metres and its covariance (2, 2) in m²"
         ) from None
     if plane.shape != (2,) or not np.isfinite(plane).all():
         raise InputError(
-            f"own centroid: place {plane.tolist()} on target {target.name}; return 2 finite "
+            f"custom centroid: position {plane.tolist()} on target {target.name}; return 2 finite "
             "numbers, metres right of and above its centre"
         )
     good = covariance.shape == (2, 2) and bool(np.isfinite(covariance).all())
@@ -139,7 +139,7 @@ def _checked(result: object, target: Target) -> tuple[FloatArray, FloatArray]:
         good = bool(least >= 0.0 < most and uneven <= 1e-9 * most)
     if not good:
         raise InputError(
-            f"own centroid: covariance {covariance.tolist()} on target {target.name}; return a "
+            f"custom centroid: covariance {covariance.tolist()} on target {target.name}; return a "
             "symmetric and positive (2, 2) matrix in m²"
         )
     return plane, covariance

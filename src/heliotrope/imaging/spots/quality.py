@@ -189,7 +189,12 @@ def judge(
             limits.second_spot,
             "a second spot has {:.0%} of its power",
         ),
-        ("cut at the edge", first.edge, limits.edge, "at the border it has {:.0%} of its peak"),
+        (
+            "cut at the edge",
+            first.edge,
+            limits.edge,
+            "its brightness at the border is {:.0%} of its peak",
+        ),
         ("cut at the edge", first.cut, limits.cut, "light beyond the border moves it by {:.2f} m"),
         ("saturated", first.clipped, limits.clipped, "{:.0%} of its light is clipped"),
         ("covered", first.covered, limits.covered, "marks cover {:.0%} of it"),
@@ -253,11 +258,13 @@ def _of_frame(target: FoundTarget, limits: Limits) -> list[Reason]:
         reasons.append(Reason("flare", contrast, limits.mark_contrast, text))
     blur = np.median([m.blur for m in used], axis=0)
     if float(blur.min()) > limits.blur:
-        text = f"the marks' edges are {float(blur.min()):.2f} m soft"
+        text = f"the marks' edges are blurred over {float(blur.min()):.2f} m"
         reasons.append(Reason("out of focus", float(blur.min()), limits.blur, text))
     motion = float(blur.max() / max(blur.min(), 1e-9))
     # Blur smaller than a mark's stroke cannot be seen and does not move the centroid.
     if motion > limits.motion and float(blur.max()) > 0.4 * limits.blur:
-        text = f"the marks are {motion:.1f} times as soft in one direction: the camera moved"
+        text = (
+            f"the marks are blurred {motion:.1f} times as much in one direction: the camera moved"
+        )
         reasons.append(Reason("moved", motion, limits.motion, text))
     return reasons

@@ -287,7 +287,7 @@ class Search:
             if apart[worst] < STRAY * spread[worst] or len(used) <= 4:
                 return view, used
             observed.reasons[used[worst]] = (
-                f"{apart[worst]:.1f} px from the place given by the others"
+                f"{apart[worst]:.1f} px from the position given by the other marks"
             )
             del used[worst]
 

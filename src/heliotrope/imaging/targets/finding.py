@@ -386,8 +386,10 @@ class _Face:
             text = self.text or (
                 f"none of its {total} marks was seen: outside the frame, or covered"
                 if self.shapes == 0
-                else f"its {total} marks were not found together; {self.shapes} shapes in the "
-                "frame look like one of them"
+                else (
+                    f"its {total} marks were not found in the right arrangement; {self.shapes} "
+                    "shapes in the frame look like one of them"
+                )
             )
             return [FoundTarget(t, False, text) for t in targets]
         results = []

@@ -55,7 +55,7 @@ class _Run:
         data = worker.asked(gathered(group))
         with self._mine:
             if self._ended:
-                raise InputError("the plant ends")
+                raise InputError("the plant is shutting down")
             self._process = subprocess.Popen(  # noqa: S603  # a program of ours
                 [sys.executable, "-m", _MODULE],
                 stdin=subprocess.PIPE,

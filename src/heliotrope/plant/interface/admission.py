@@ -47,9 +47,9 @@ class Admission:
         BusyError
             If there were too many orders of this person or of all users.
         """
-        whose, wait = f"of {person.name}", self._own.take(person.name)
+        whose, wait = f"from {person.name}", self._own.take(person.name)
         if wait == 0.0:
-            whose, wait = "of all users", self._all.take("")
+            whose, wait = "from all users", self._all.take("")
         if wait > 0.0:
             raise BusyError(
                 f"{call}: too many orders {whose}, so nothing was sent; try again in "

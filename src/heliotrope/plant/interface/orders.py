@@ -176,9 +176,7 @@ class TimetableOrderEntry(Strict):
     target: Annotated[str, Field(max_length=64)] = ""
     at: Annotated[
         list[Annotated[str, Field(max_length=20)]],
-        Field(
-            max_length=MOST_TIMES, description="Times of day with their time zone, such as 08:30Z."
-        ),
+        Field(max_length=MOST_TIMES, description="Times of day with a time zone, such as 08:30Z."),
     ] = []
     every_s: Annotated[float, Field(ge=LEAST_INTERVAL, le=DAY)] | None = None
     rule: Annotated[
@@ -407,7 +405,7 @@ class _Places(SomeHeliostats):
     @model_validator(mode="after")
     def _named(self) -> Self:
         if not (self.heliostats or self.targets or self.receivers or self.tower):
-            raise ValueError("names nothing; name heliostats, targets, receivers or the tower")
+            raise ValueError("no object is named; name heliostats, targets, receivers or the tower")
         return self
 
 

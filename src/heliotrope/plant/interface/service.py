@@ -165,7 +165,9 @@ class PlantInterface:
             If the plant is real.
         """
         if not self._desk.operations.simulated:
-            raise InputError("one-time link: the plant is real; its people sign in by passwords")
+            raise InputError(
+                "one-time link: not available for a real plant, whose users sign in with passwords"
+            )
         return f"{address}enter?once={self._link.make(name)}"
 
     def in_plant(self, work: Callable[[], T]) -> "Future[T]":

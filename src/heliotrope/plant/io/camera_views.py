@@ -77,7 +77,7 @@ def light_of(
         found = find_targets(linear, targets, camera, (), settings.pictures)
         own = next(one for one in found if one.target.name == target.name)
         if own.view is None:
-            raise InputError(f"target {target.name}: {own.reason}; look at the camera")
+            raise InputError(f"target {target.name}: {own.reason}; check the camera")
         view = own.view
         found = [one for one in found if one.view is view]
     rim = max(LEAST_RIM, rim_of(found))

@@ -301,8 +301,11 @@ class RealCameras:
         age = (self._clock.utc() - frame.time).total_seconds()
         shot = shot_of(seen, target, self._clock.monotonic() - age)
         if frame.time_deviation > _UNSURE:
-            known = f"{frame.time_deviation:.2g} s only, the limit is {_UNSURE:g} s"
-            text = f"time: known within {known}; set the camera to write its time with a time zone"
+            known = f"{frame.time_deviation:.2g} s, the limit is {_UNSURE:g} s"
+            text = (
+                f"time: known only to within {known}; set the camera to write its time with a "
+                "time zone"
+            )
             shot = replace(shot, reasons=(*shot.reasons, text))
         return shot
 
@@ -317,10 +320,10 @@ class RealCameras:
         eye = self._eye(target.name)
         frame = await self._frame(eye, target.name)
         if frame.time_deviation > _UNSURE:
-            known = f"{frame.time_deviation:.2g} s only, the limit is {_UNSURE:g} s"
+            known = f"{frame.time_deviation:.2g} s, the limit is {_UNSURE:g} s"
             raise FetchError(
-                f"camera {eye.camera.name}: the time of its frames is known within {known}; "
-                f"set the camera to write its time with a time zone"
+                f"camera {eye.camera.name}: the time of its frames is known only to within "
+                f"{known}; set the camera to write its time with a time zone"
             )
         assert frame.time is not None
         taken = frame.time.timestamp()

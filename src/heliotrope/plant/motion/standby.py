@@ -303,10 +303,11 @@ class StandbyField:
         lights = [hottest(self._beams(points, sun), self.center, self._around) for sun in self.suns]
         worst = max(lights, key=lambda light: light.bound)
         return InputError(
-            f"standby: no spread keeps {limit:g} suns: with points up to {self._inner + size:.0f} "
-            f"m from the receiver there are {worst.suns:.1f} suns at {point_text(worst.point)} m, "
-            f"and a wider spread would be too low or return later than {LONGEST_RETURN:g} times "
-            f"today's return; a limit of {np.ceil(worst.bound):.0f} suns holds"
+            f"standby: no spread stays below {limit:g} suns: with points up to "
+            f"{self._inner + size:.0f} m from the receiver there are {worst.suns:.1f} suns at "
+            f"{point_text(worst.point)} m, and a wider spread would be too low or return later "
+            f"than {LONGEST_RETURN:g} times today's return; a limit of "
+            f"{np.ceil(worst.bound):.0f} suns can be met"
         )
 
     def _check_eyes(self, points: FloatArray) -> None:

@@ -15,7 +15,8 @@ the first round follows at once, further rounds follow shortly while heliostats 
 and only heliostats that stand ready at standby take part in it. Before the sun is so low that
 automatic control stows the field, they leave along the same ramp. If the measured flux is above the
 limit, the limit of the cells concerned is lowered by the ratio of the measured to the predicted
-flux, so that the same moves relieve them.
+flux, so that the same moves relieve them. Where errors under the limit cost power, heliostats are
+calibrated first whose errors cost most.
 """
 
 import asyncio
@@ -396,7 +397,13 @@ class Aiming:
         return len(self._beyond) == 1
 
     def _accept(self, answer: Answer, now: float) -> None:
-        """Accept new aims, which end the alarm about late aims."""
+        """Accept new aims, which end the alarm about late aims.
+
+        Errors under the limit cost power: the heliostats whose errors cost most are calibrated
+        first.
+        """
+        mean = float(answer.worth.mean())
+        self._plant.worth = 1.0 + (answer.worth / mean if mean > 0.0 else 0.0 * answer.worth)
         self._answer, self._source, self._good_at = answer, "optimiser", now
         if self._problem:
             self._problem = ""

@@ -80,7 +80,7 @@ class WaitingChange:
     def text(self) -> str:
         """What the change sets, and why, in words."""
         what = ", ".join(f"{parameter.name} {parameter.asked:g}" for parameter in self.parameters)
-        again = f"back to version {self.version}: " if self.version else ""
+        again = f"restore version {self.version}: " if self.version else ""
         return f"PARAMETERS {self.heliostat}: {again}{what} ({self.reason})"
 
 

@@ -329,8 +329,7 @@ class AutomaticControl:
                 else ("the plant file does not name a camera for it")
             )
             why = (
-                "the visit takes place on the receiver, where no beam is searched for or sent to a "
-                "target"
+                "a receiver visit neither searches for a beam nor uses a target"
                 if search or target
                 else why
             )
@@ -392,7 +391,7 @@ class AutomaticControl:
             elif idle == _STARTING:
                 steps[name] = Step(idle)
             elif idle:
-                text = f"it is under automatic control, which moves nothing: {idle}"
+                text = f"it is under automatic control, which is idle: {idle}"
                 steps[name] = Step(text, Stage.FAILED)
             elif name in visiting:
                 steps[name] = Step("it is under automatic control and being calibrated", Stage.DONE)
@@ -755,7 +754,7 @@ class AutomaticControl:
             names = tuple(self._plant.field.names[row] for row in rows)
             self._plant.stow(AUTOMATIC.name, names)
             text = (
-                "cannot continue from its present position, so it goes to stow and is raised again"
+                "cannot continue from its current position, so it goes to stow and is raised again"
             )
             for name in names:
                 self._log.event("plant", name, text)

@@ -98,7 +98,7 @@ def _case(
     if plant.sentinel.on:
         causes = "; ".join(f"{who}: {text}" for who, text in plant.sentinel.causes().items())
         return (
-            f"an emergency holds ({causes})",
+            f"an emergency is active ({causes})",
             "Its beam stays off the receiver; after the emergency, nothing moves by itself.",
             "When the cause is gone, "
             + ("withdraw the order, then " if plant.sentinel.calls else "")

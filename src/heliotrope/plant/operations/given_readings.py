@@ -68,8 +68,8 @@ class GivenReadings:
         age, now = self._plant.clock.utc().timestamp() - at, self._plant.now()
         if age > OLDEST:
             raise InputError(
-                f"{name}: the reading is {age:.1f} s old, the limit is {OLDEST:g} s; send readings "
-                f"at once, and compare the clocks of both computers"
+                f"{name}: the reading is {age:.1f} s old, the limit is {OLDEST:g} s; send each "
+                "reading immediately, and compare the clocks of both computers"
             )
         if age < -AHEAD:
             raise InputError(

@@ -355,7 +355,7 @@ class Operations:
         """
         _operator(person, "note")
         if not text.strip():
-            raise InputError("note: the text is empty; write what the next shift has to know")
+            raise InputError("note: the text is empty; write what the next shift needs to know")
         self._tell(person, text.strip(), NOTE)
 
     async def _read(self, what: str, read: Callable[[Records], T]) -> T:

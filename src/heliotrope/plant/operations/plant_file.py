@@ -369,7 +369,7 @@ class PlantFile:
         if tried.error is not None:
             raise InputError(f"plant file: {_line(tried.error)} (nothing was stored)")
         if not tried.difference:
-            raise InputError("plant file: the text is the same as the present file")
+            raise InputError("plant file: the text is the same as the current file")
         return tried
 
     async def _write(
@@ -382,9 +382,9 @@ class PlantFile:
             views = await self._views(person, author, tried)
         by = f"{author}, approved by {person.name}" if author else person.name
         tables = ", ".join(f"{d.table} {d.name}".strip() for d in tried.differs) or "no table"
-        at = "used at once" if views else "takes effect when the plant restarts"
+        at = "takes effect immediately" if views else "takes effect when the plant restarts"
         if not tried.differs:
-            at = "the plant uses these values already"
+            at = "the plant already uses these values"
         self._plant.note(person, "PLANT FILE", f"{by}: {tables}; {at} ({reason})")
         change = f"stored from the console by {by}: {tables} ({reason})"
         # The caller may leave meanwhile; what has been written is used and recorded all the same.

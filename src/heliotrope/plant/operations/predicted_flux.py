@@ -90,8 +90,9 @@ class PredictedFlux:
         """
         if missing := self._unreported():
             raise RefusedError(
-                f"flux: not yet known; {missing:,} of {len(self._plant.field):,} heliostats have "
-                "not yet reported their positions since the start; ask again in some seconds"
+                f"flux: not yet known; {missing:,} of {len(self._plant.field):,} heliostats "
+                "have not reported their positions since the plant started; ask again in a few "
+                "seconds"
             )
         running = self._computing
         if running is None and self._plant.now() - self._made_at >= EVERY:
@@ -104,8 +105,8 @@ class PredictedFlux:
                     raise RefusedError(f"flux: not predicted now ({error})") from error
         if not self._views and self._surfaces:
             raise RefusedError(
-                "flux: the first prediction since the start is still being computed (about "
-                "a minute after an installation, otherwise seconds); ask again"
+                "flux: the first prediction since the plant started is still being computed "
+                "(about a minute after an installation, otherwise seconds); ask again shortly"
             )
         return self._views
 

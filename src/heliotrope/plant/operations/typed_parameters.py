@@ -376,7 +376,7 @@ class TypedParameters:
         name, beliefs = record.heliostat, self._plant.beliefs
         if not reason.strip():
             raise InputError(
-                f"{name}: a reason is needed for changing parameters; enter one for the audit"
+                f"{name}: a reason is needed for changing parameters; enter one for the audit log"
             )
         before = items_of(beliefs.present(name)[0])
         after = items_of(record.mechanism(beliefs.nominal(name))[0])

@@ -214,7 +214,7 @@ class JsonLines:
         if disk.f_bavail * disk.f_frsize < LEAST_FREE:
             raise AuditError(
                 f"audit {self.path}: {disk.f_bavail * disk.f_frsize} bytes are left on its disk, "
-                f"the minimum is {LEAST_FREE}; make room"
+                f"the minimum is {LEAST_FREE}; free some space"
             )
 
     def close(self) -> None:

@@ -94,8 +94,8 @@ class Person:
     def __post_init__(self) -> None:
         if not self.name.strip():
             raise InputError(
-                "person: the name is empty; enter a name, because the audit must "
-                "record who commands"
+                "person: the name is empty; enter a name, because the audit log must record "
+                "who gives each command"
             )
 
     def must_be(self, needed: Role, what: str) -> None:

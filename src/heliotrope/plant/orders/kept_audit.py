@@ -194,5 +194,6 @@ def _room(keeper: Keeper) -> str | None:
     if free >= LEAST_FREE:
         return None
     return (
-        f"store {file}: {free} bytes are left on its disk, the minimum is {LEAST_FREE}; make room"
+        f"store {file}: {free} bytes are left on its disk, the minimum is {LEAST_FREE}; free "
+        "some space"
     )

@@ -274,12 +274,12 @@ class Judge:
                 return best, best.assignment.reason
         wanting = int((late | worthy).sum())
         if self.more:
-            return None, f"none found yet; {wanting} need a visit, and not all were judged"
+            return None, f"no useful visit found yet; heliostats due: {wanting}, not all assessed"
         if wanting:
-            return None, f"{wanting} need a visit, but none of them can gain from one now"
+            return None, f"heliostats due for a visit: {wanting}; none would benefit from one now"
         if not ready.any():
             return None, "no heliostat is ready"
-        return None, f"{int(ready.sum())} are ready, and all are known well enough"
+        return None, f"heliostats ready: {int(ready.sum())}; all are calibrated well enough"
 
     def _best(
         self, moment: Moment, chosen: Mask, targets: Sequence[str], overdue: bool
@@ -319,12 +319,19 @@ class Judge:
             rows.append(mine)
             places.append(np.full(len(mine), t, dtype=np.intp))
             late = moment.age[mine] + 1.0
-            bounds.append(late if overdue else self._worth(square, 0.0, seen))
+            bounds.append(late if overdue else self._worth(square, 0.0, seen, mine))
         return np.concatenate(rows), np.concatenate(places), np.concatenate(bounds)
 
-    def _worth(self, gain: FloatArray, drive: npt.ArrayLike, seen: FloatArray) -> FloatArray:
-        """Return the gain of a visit per second, rad²/s."""
-        return np.asarray(gain * self._chance(seen) / self._time(drive, seen))
+    def _worth(
+        self,
+        gain: FloatArray,
+        drive: npt.ArrayLike,
+        seen: FloatArray,
+        rows: npt.NDArray[np.intp],
+    ) -> FloatArray:
+        """Return the gain of visits to heliostats per second, rad²/s times their worth, (K,)."""
+        worth = self._known.worth[rows]
+        return np.asarray(worth * gain * self._chance(seen) / self._time(drive, seen))
 
     def _chance(self, seen: FloatArray) -> FloatArray:
         """Return the probability that a visit sees the beam."""
@@ -356,7 +363,7 @@ class Judge:
                 free &= share <= settings.most_hidden
             square = moment.square[mine]
             seen = sight.seen(square, mine)
-            value = self._worth(look.gain, look.drive, seen)
+            value = self._worth(look.gain, look.drive, seen, mine)
             if overdue:
                 # Prefer the target that yields more information.
                 value = moment.age[mine] + look.gain / np.maximum(square, 1e-30)
@@ -387,6 +394,8 @@ class Judge:
         before = float(np.sqrt(moment.square[row]))
         after = float(np.sqrt(max(moment.square[row] - look.gain[k], 0.0)))
         reason = f"expected beam error {1e3 * before:.2f} to {1e3 * after:.2f} mrad"
+        if (worth := self._known.worth[row]) > 1.0:
+            reason += f", which counts {worth:.1f} times under the flux limit"
         if overdue:
             reason = f"due: {moment.age[row] / DAY:.1f} days old; {reason}"
         return Assignment(

@@ -274,6 +274,8 @@ class FieldKnowledge:
         Feet of the heliostats, and width and height of the mirrors, m, (N, 3) and (N, 2).
     near
         Rows of the nearest neighbours, (N, K).
+    worth
+        How much a smaller squared error of each heliostat counts beside the others, (N,).
 
     Raises
     ------
@@ -308,6 +310,7 @@ class FieldKnowledge:
         self._rows = [np.array([self.row[n] for n in g.names], dtype=np.intp) for g in groups]
         self.group, self._place = np.empty((2, count), dtype=np.intp)
         self.position, self.size = np.empty((count, 3)), np.empty((count, 2))
+        self.worth = np.ones(count)
         for g, (group, rows) in enumerate(zip(groups, self._rows, strict=True)):
             self.group[rows], self._place[rows] = g, np.arange(len(rows))
             self.position[rows] = group.position

@@ -90,6 +90,7 @@ class PlantSchedule:
             # The target is free, so the previous visit there has ended without a result.
             if gone.target == target and not beside:
                 self.scheduler.cancel(gone.heliostat)
+        self.scheduler.weigh(self._plant.worth)
         assignment = self.scheduler.next(
             self._plant.clock.utc(),
             self._plant.sun_vector(),
@@ -120,6 +121,7 @@ class PlantSchedule:
         now = self._plant.now()
         if self._coming is None and now - self._made >= REPLAN:
             self._draft = []
+            self.scheduler.weigh(self._plant.worth)
             self._coming = self.scheduler.upcoming(
                 self._plant.clock.utc(), HORIZON, self._states(ready)
             )

@@ -223,6 +223,6 @@ def _told(plan: CommissionPlan) -> str:
         when = datetime.fromtimestamp(plan.reached, UTC)
         return f"90 % of the heliostats are within {goal:.2f} mrad by {when:%H:%M} UTC"
     return (
-        f"90 % of the heliostats are within {high:.2f} mrad at the end of the day, not within "
-        f"{goal:.2f} mrad; limited by {plan.limit}"
+        f"90 % of the heliostats are within {high:.2f} mrad at the end of the day, short of the "
+        f"goal of {goal:.2f} mrad; limited by {plan.limit}"
     )

@@ -50,7 +50,7 @@ VISITS = RetryLaw(
     "visit to a target",
     5,
     900.0,
-    "a person looks at the mirror; one visit a day until then",
+    "someone must inspect the mirror; until then it gets one visit a day",
     longest=DAY,
     rest=16.0 * 3600.0,
     alarm=alarms.CALIBRATION_GIVEN_UP,
@@ -331,6 +331,10 @@ class Scheduler:
             return False
         self._known.doubt(row, error**2 / expected)
         return True
+
+    def weigh(self, worth: FloatArray) -> None:
+        """Set how much a smaller squared error of each heliostat counts beside the others, (N,)."""
+        self._known.worth = worth
 
     def _find(self, heliostat: str) -> int:
         if heliostat not in self._known.row:

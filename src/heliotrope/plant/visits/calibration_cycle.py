@@ -475,7 +475,7 @@ class CalibrationCycle:
             visit.taken_off()
             raise
         plant.want(name, present[0])
-        said = f"{problem}; the old parameters are back"
+        said = f"{problem}; the old parameters are in use again"
         return replace(fit, outcome=CalibrationOutcome.NOT_VERIFIED, problem=said), ()
 
     def _take(self, visit: Visit, fit: JudgedFit, pushed: tuple[str, ...]) -> HeliostatCalibration:

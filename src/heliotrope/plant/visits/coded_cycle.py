@@ -383,7 +383,7 @@ class CodedCycle(ABC):
         chosen = [layout.names.index(name) for name in visit.names]
         pictures = await taken.read()
         moves = layout.moves[[number for number, _ in pictures]][:, chosen]
-        tell("taking the beams apart")
+        tell("separating the beams")
         lights, worker = [one for _, one in pictures], self.cycle.worker
         middle, axes = float(np.mean([one.at for one in lights])), layout.target.axes
         beams = await worker(

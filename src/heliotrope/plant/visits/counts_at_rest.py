@@ -93,7 +93,10 @@ class CountsHeard:
         """Return the step counts at the aim without movement, (2,), or why these are unknown."""
         count = len(self.counts)
         if count < _LEAST_ROWS:
-            return f"its step counts were heard {count} times at its aims; {_LEAST_ROWS} needed"
+            return (
+                f"its step counts were reported {count} times at its aims; {_LEAST_ROWS} "
+                "reports are needed"
+            )
         heard = np.concatenate([self.counts, self.counts[-1:]])
         ordered = self._counts(np.array([*self.aims, self.base]), heard)
         rest = self._counts(np.tile(self.base, (count + 1, 1)), heard)

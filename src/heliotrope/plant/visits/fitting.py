@@ -390,18 +390,20 @@ def _judge(
     if far.max() > settings.most:
         p = int(np.argmax(far))
         return CalibrationOutcome.IMPLAUSIBLE, (
-            f"{fitted.names[p]} would be {far[p]:.1f} standard deviations of its prior, "
-            f"above {settings.most:g}; look at the photographs and the installation"
+            f"{fitted.names[p]} would be {far[p]:.1f} prior standard deviations from its "
+            f"expected value, above the limit of {settings.most:g}; check the photographs and "
+            "the installation"
         )
     if not after <= settings.left:
         return CalibrationOutcome.POOR_FIT, (
-            f"the fit leaves {1e3 * after:.1f} mrad RMS, above {1e3 * settings.left:g} mrad; "
-            "look at the photographs: is it this heliostat's beam?"
+            f"the fit leaves {1e3 * after:.1f} mrad RMS, above the limit of "
+            f"{1e3 * settings.left:g} mrad; check in the photographs that the beam is this "
+            "heliostat's"
         )
     if not after <= settings.gain * np.hypot(before, room):
         return CalibrationOutcome.NO_BETTER, (
-            f"the fit misses by {1e3 * after:.2f} mrad RMS, not below {settings.gain:g} times "
-            f"the {1e3 * before:.2f} mrad before"
+            f"the fit leaves {1e3 * after:.2f} mrad RMS, which is not below {settings.gain:g} "
+            f"times the previous {1e3 * before:.2f} mrad"
         )
     return CalibrationOutcome.CALIBRATED, ""
 

@@ -315,7 +315,7 @@ class _Verification:
             return problems, [], waits
         again = CodedVisit(plant, self._visit.mandate, layout.names, target)
         paths = {n: plant.misled(n, point) for n, point in layout.start().items()}
-        text = "the new parameters have no free path to their photograph"
+        text = "with the new parameters the path to the verification photograph is not free"
         again.drop({name: f"{text}: {why}" for name, why in paths.items() if why})
         proven, others = await self._coded.photographed(
             again, layout, self._light, lambda stage: self._tell(f"verification: {stage}")

@@ -159,7 +159,7 @@ class Centred:
             return None, f"no beam was seen on {target.name} in {tries} photographs"
         corner = np.array(CORNERS[0]) * room_of(visit, self._centring)
         goal = np.asarray(light.aim + corner @ target.axes)
-        tell("does it move with the aim?")
+        tell("checking that it moves with the aim")
         await self._go(visit, goal, light.aim)
         shot = await photographed(self._camera, visit)
         astray = self._astray(target, shot, goal, light)
@@ -167,7 +167,7 @@ class Centred:
             astray = "the target is too small to move a beam on it"
         if astray or seen(target, shot) is None:
             said = astray or "; ".join(shot.reasons)
-            return None, f"light was seen, but not that it moves with the aim: {said}"
+            return None, f"light was seen, but was not shown to move with the aim: {said}"
         return light.place - target.axes @ (light.first - target.center), ""
 
     async def _find(self, visit: Visit, before: FloatArray, tell: Tell) -> "_Light | None":
@@ -250,7 +250,7 @@ class Centred:
         away = float(np.linalg.norm(place - expected))
         if away <= self._centring.astray * min(target.width, target.height):
             return None
-        return f"light {away:.1f} m from the expected place: another heliostat's beam"
+        return f"light {away:.1f} m from the expected position: another heliostat's beam"
 
     async def _go(self, visit: Visit, aim: FloatArray, before: FloatArray) -> None:
         if np.linalg.norm(aim - before) > _SAME:

@@ -101,8 +101,8 @@ class ReceiverCycle(CodedCycle):
         seen = np.logical_and.reduce([frame.seen for frame in frames])
         if seen.mean() < _SEEN:
             raise InputError(
-                f"camera {self.settings.camera}: {100.0 * seen.mean():.0f} % of {face.name} are "
-                "seen below full scale; shorten its exposure"
+                f"camera {self.settings.camera}: {100.0 * seen.mean():.0f} % of {face.name} is "
+                "below full scale in its frames; shorten its exposure"
             )
         values = np.mean([frame.values / frame.exposure for frame in frames], axis=0)
         at = float(np.mean([frame.at for frame in frames]))
@@ -138,7 +138,7 @@ class ReceiverCycle(CodedCycle):
 
     async def _steady(self, face: Target, light: Light, tell: Tell) -> float:
         """Return the brightness of the receiver; raise an error if it changes."""
-        tell("is the sun steady?")
+        tell("checking that the sun is steady")
         seen = []
         for _ in range(_LOOKS):
             seen.append((await light_on(self._camera, face, light.view)).brightness)

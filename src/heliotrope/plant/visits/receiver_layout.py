@@ -67,7 +67,7 @@ def arranged_on(
             del known[name]
     for name in list(known)[settings.most :]:
         del known[name]
-        blocked[name] = f"{settings.most} heliostats take part at once; it can come later"
+        blocked[name] = f"{settings.most} heliostats already take part; it can join a later visit"
     places = {name: face.plane_coordinates(aims[name]) for name in known}
     limit = settings.power * REFLECTED * sunlight_on(plant, face)
     costs = {name: _cost(face, places[name], known[name], settings) for name in known}

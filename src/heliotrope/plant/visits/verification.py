@@ -160,7 +160,10 @@ class Verification:
         self._confirmed.pop(visit.heliostat, None)
         point = apart(visit.target, [shot.point for shot in used], room_of(visit, self._centring))
         if why := visit.plant.misled(visit.heliostat, point):
-            return f"the new parameters have no free path to their photograph: {why}"
+            return (
+                "with the new parameters the path to the verification photograph is not free: "
+                f"{why}"
+            )
         async with visit:
             tell("verification")
             await visit.go(self._settings.arrival, point)
@@ -183,8 +186,8 @@ class Verification:
         allowed = min(most * found.reach, self._settings.left)
         return (
             f"with the new parameters the beam is {found.slant * found.miss:.2f} m from its "
-            f"predicted place, and {found.slant * allowed:.2f} m are allowed; look at the "
-            "photographs: is it this heliostat's beam?"
+            f"predicted position, and only {found.slant * allowed:.2f} m are allowed; check in "
+            "the photographs that the beam is this heliostat's"
         )
 
 

@@ -202,7 +202,7 @@ class Visit(BroughtHome):
         ended = self.plant.now()
         while self.plant.field.heard[self.row] <= ended:
             if self.plant.now() - ended > SILENT:
-                raise RefusedError(f"{self.heliostat}: not heard within {SILENT:g} s after {what}")
+                raise RefusedError(f"{self.heliostat}: no report within {SILENT:g} s after {what}")
             await self.look()
 
     async def command(
@@ -346,8 +346,8 @@ class Visit(BroughtHome):
         while not (sum(self._there) > 1 and self._heard_there()[-1] >= instant):
             if self.plant.now() >= until:
                 raise RefusedError(
-                    f"{self.heliostat}: not heard at its aim within {limit:g} s of the photograph, "
-                    "so its position in it is unknown"
+                    f"{self.heliostat}: no report of its position at its aim within {limit:g} s "
+                    "of the photograph, so its position in the photograph is unknown"
                 )
             await self.look()
         times = self._heard_there()

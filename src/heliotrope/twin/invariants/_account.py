@@ -22,7 +22,7 @@ SERVED = 2.0
 BRAKING = 1.0
 #: Reason why a heliostat that its cluster's file does not name must leave: it still receives SUN
 #: and stays DEFOCUSED.
-UNLISTED = "it is missing in the cluster's file"
+UNLISTED = "it is missing from the cluster's file"
 #: Tolerance of the true stow position, steps.
 NEAR_STOW = 5000
 
@@ -286,7 +286,9 @@ class HeliostatAccount:
                 return ""
             raised = self.place()[1] not in {elevation for _, elevation in self.stows}
             return (
-                f"azimuth moves to stow while elevation is at {self.place()[1]}" if raised else ""
+                f"azimuth moves to stow while elevation is still at {self.place()[1]}"
+                if raised
+                else ""
             )
         if self._leg == 0 or board.state != states.APPROACHING:
             return None
@@ -298,7 +300,7 @@ class HeliostatAccount:
             if board.axes[0].idle and board.axes[1].idle:
                 self._leg = 0
                 return ""
-            return "azimuth moves on while elevation leaves stow"
+            return "azimuth keeps moving while elevation leaves stow"
         self._leg = 2
         return ""
 

@@ -200,7 +200,7 @@ class AlarmObserver(Judge):
             ends = max(since, rests.get(subject, inf), self._runs_since)
             passed = now - (max(ends, self._wrote_at) if kind == UNWRITTEN else ends)
             limit = self._by_faults.get(kind, inf)
-            saw = f"{kind} stands {passed:.0f} s after the last fault, limit {limit:g} s"
+            saw = f"{kind} is active {passed:.0f} s after the last fault, limit {limit:g} s"
             self.check(16, passed <= limit, now, subject, saw)
         for cluster, some in self._clusters.items():
             self._named_cluster(cluster, now)
@@ -214,7 +214,9 @@ class AlarmObserver(Judge):
         self._runs_since = min(self._runs_since, now) if runs else inf
         named = any(kind == "sun_contradicted" for kind, _ in self._active)
         passed = now - self._runs_since
-        saw = f"its time has been wrong for {passed:.0f} s, and no sun_contradicted says so"
+        saw = (
+            f"its time has been wrong for {passed:.0f} s, and sun_contradicted has not been raised"
+        )
         self.check(16, named or passed <= CONTRADICTED_WITHIN, now, "plant", saw)
 
     def _caused(
@@ -227,10 +229,10 @@ class AlarmObserver(Judge):
         self.check(16, known, now, subject, f"{saw}: nothing in this world causes it")
         self.check(16, subject in rests, now, subject, f"{saw}: there is no {subject!r}")
         sense = len(alarm.text) > len(kind) and not _NONSENSE.search(alarm.text)
-        self.check(16, sense, now, subject, f"{saw}: that says nothing")
+        self.check(16, sense, now, subject, f"{saw}: the text says nothing")
         recalled = now - self._began_at <= RECALLED_WITHIN
         if kind == CALLED and self._alone:
-            nobody = f"{saw}: nobody has called one since the last was over"
+            nobody = f"{saw}: nobody has ordered one since the last one ended"
             self.check(L2, called or recalled, now, subject, nobody)
         if kind in UNORDERED and self._works:
             calm = now - rests[""]
@@ -245,7 +247,7 @@ class AlarmObserver(Judge):
     def _named_cluster(self, cluster: str, now: float) -> None:
         silent = now - max(self._heard[cluster], self._runs_since)
         named = ("cluster_silent", cluster) in self._active
-        saw = f"the plant has heard nothing of it for {silent:.1f} s, and no alarm says so"
+        saw = f"the plant has received nothing from it for {silent:.1f} s, and no alarm says so"
         self.check(16, named or silent <= UNHEARD_WITHIN, now, cluster, saw)
 
     def _named(self, name: str, well: float, now: float, files: Mapping[str, str]) -> None:
@@ -261,5 +263,5 @@ class AlarmObserver(Judge):
                 continue
             passed = now - max(since.setdefault(name, now), well)
             named = (alarm, name) in self._active
-            saw = f"it is {what} for {passed:.1f} s, and no {alarm} names it"
+            saw = f"it has been {what} for {passed:.1f} s, and no {alarm} names it"
             self.check(16, named or passed <= within, now, name, saw)

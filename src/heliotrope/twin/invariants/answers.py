@@ -159,28 +159,28 @@ class AnswerObserver(Judge):
         def check(good: bool, saw: str) -> None:
             self.check(11, good, now, name, prefix + saw)
 
-        check(state == account.state, f"state {state}, and it is {account.state}")
-        check((supply, warmth) == (0, 0), f"{supply} mV, {warmth} °C; it measures neither")
+        check(state == account.state, f"state {state}, but it is {account.state}")
+        check((supply, warmth) == (0, 0), f"{supply} mV, {warmth} °C, but it measures neither")
         faulty = account.state in (states.FAULT, states.LOCKED)
         check(faulty or fault == 0, f"fault {fault}")
         check(account.state != states.FAULT or fault != 0, "no fault")
         held = account.board.node.journal.items if account.board.node is not None else {}
         right = zlib.crc32(held.get("armature", b"")) if "armature" in held else 0
-        check(crc == right, f"armature {crc:08x}, and it stores {right:08x}")
+        check(crc == right, f"armature {crc:08x}, but it stores {right:08x}")
         self._booted(board, int(boots), now)
         self._flags(board, int(flags), now)
         if not account.ticks_jumped:
             since = now - account.booted_at
             near = abs(uptime + 0.5 - since) <= UPTIME_NEAR
-            check(near, f"{uptime} s since a boot of {since:.1f} s ago")
+            check(near, f"{uptime} s of uptime, but it booted {since:.1f} s ago")
             if flags & _SUN_FRESH:
                 age = now - account.sun_at
-                saw = f"{prefix}a sun of {age_ms} ms, and it left {age:.2f} s ago"
+                saw = f"{prefix}a sun vector {age_ms} ms old, but it was sent {age:.2f} s ago"
                 # A reply may have begun before the latest sun vector arrived.
                 near = age < BEGUN or abs(age_ms / 1000.0 - age) <= AGE_NEAR
                 self._calmly(near, name, saw)
         if not flags & _SUN_FRESH:
-            check(age_ms == NEVER, f"a sun of {age_ms} ms that is not fresh")
+            check(age_ms == NEVER, f"a sun vector {age_ms} ms old that is not marked as fresh")
 
     def _booted(self, board: _Board, boots: int, now: float) -> None:
         account = board.account
@@ -188,7 +188,7 @@ class AnswerObserver(Judge):
         board.boots, board.booted = boots, (account.boots, account.cuts)
         if before is not None:
             least, most = account.boots - boots_then, account.cuts - cuts_then
-            saw = f"{boots} boots, after {before}; it has booted {least} times since"
+            saw = f"{boots} boots, after {before} before, but it has booted {least} times since"
             # A boot that a power cut interrupted may have been counted.
             good = account.unsure or least <= boots - before <= most
             self.check(11, good, now, account.name, saw)
@@ -198,45 +198,50 @@ class AnswerObserver(Judge):
         name, state = account.name, account.state
 
         def check(good: bool, saw: str) -> None:
-            self.check(11, good, now, name, f"flags {flags:#x} as {states.STATES[state]}: {saw}")
+            self.check(
+                11, good, now, name, f"flags {flags:#x} in state {states.STATES[state]}: {saw}"
+            )
 
         check(not flags & _NEVER_SET, "a fault, a switch or a key that it does not have")
         turns = now - account.stepped_at < TURNS
-        check(bool(flags & _MOVING) or not turns, "it does not move, and its motors turn")
+        check(bool(flags & _MOVING) or not turns, "it reports no motion, but its motors turn")
         # A motion that has just begun is about to make its first step. Between two replies that are
         # far apart, one motion may have ended and another begun.
         lapsed, board.told_at = now - board.told_at > RESTS, now
         before = inf if lapsed else board.moves_since
         board.moves_since = min(before, now) if flags & _MOVING else inf
         rests = now - max(account.stepped_at, account.changed_at, board.moves_since)
-        saw = f"it moves, and its motors have rested for {rests:.1f} s"
+        saw = f"it reports motion, but its motors have been at rest for {rests:.1f} s"
         check(account.ticks_jumped or rests <= RESTS, saw)
         age = now - account.sun_at
-        saw = f"the sun left {age:.1f} s ago"
-        check(not flags & _SUN_FRESH or age <= OLD, f"fresh, and {saw}")
+        saw = f"the sun vector was sent {age:.1f} s ago"
+        check(not flags & _SUN_FRESH or age <= OLD, f"fresh, but {saw}")
         # On a bus without keys, a stranger's frame can use up the frame counts, including that of
         # SUN.
         fresh = bool(flags & _SUN_FRESH) or account.ticks_jumped or account.misled
         self._calmly(
             bool(fresh) or age < BEGUN or age >= FRESH,
             name,
-            f"STATUS says that no sun is fresh, and {saw}",
+            f"STATUS says that no sun vector is fresh, but {saw}",
         )
-        check(not flags & _SUN_FRESH or bool(flags & _CLOCK_SET), "a sun without a time")
+        check(not flags & _SUN_FRESH or bool(flags & _CLOCK_SET), "a sun vector without a time")
         complete = state != states.UNCONFIGURED
         check(bool(flags & _CONFIGURED) == complete, "whether it is configured")
-        check(not flags & _READY or account.by_way, "ready, and it has not come to standby")
+        check(not flags & _READY or account.by_way, "ready, but it has not reached standby")
         up = state in (states.TRACKING, states.SEARCHING)
         check(bool(flags & _READY) or not up, "not ready")
         stows = account.place() == account.stow()
         known = not flags & _UNKNOWN
-        check(not flags & _AT_STOW or not known or stows, f"at stow, and at {account.place()}")
+        check(
+            not flags & _AT_STOW or not known or stows, f"at stow, but it is at {account.place()}"
+        )
         check(bool(flags & _AT_STOW) or state != states.STOWED, "not at stow")
         slips = any(account.board.slip) and not account.unsure
-        saw = f"its step counts are sure, and wrong by {account.board.slip}"
+        saw = f"its step counts are reported as certain, but are wrong by {account.board.slip}"
         check(bool(flags & (_DOUBTFUL | _UNKNOWN)) or not slips, saw)
         check(
-            not flags & (_DOUBTFUL | _UNKNOWN) or account.boots > 0, "counts in doubt, and no boot"
+            not flags & (_DOUBTFUL | _UNKNOWN) or account.boots > 0,
+            "step counts are reported as doubtful, but it has not booted",
         )
 
     def _steps(self, board: _Board, values: Sequence[int], now: float) -> None:
@@ -246,17 +251,23 @@ class AnswerObserver(Judge):
             return
         counts, goals = tuple(values[:2]), tuple(values[2:])
         place = account.place()
-        saw = f"STEPS says {counts}, and it is at {place}"
+        saw = f"STEPS says {counts}, but it is at {place}"
         self.check(11, counts == place, now, account.name, saw)
         inside = all(low <= goal <= high for goal, (low, high) in zip(goals, RANGES, strict=True))
-        self.check(11, inside, now, account.name, f"STEPS says goals {goals} beyond its range")
+        self.check(
+            11,
+            inside,
+            now,
+            account.name,
+            f"STEPS gives the goals {goals}, which are beyond its range",
+        )
         held = account.state in (states.STOWED, states.LOCKED, states.FAULT) and goals != place
         # A boot ends the motion; a later motion with the same goals is a new one.
         goes_on = goals == board.goals and board.off_since > account.booted_at
         before = board.off_since if goes_on else inf
         board.goals, board.off_since = goals, min(before, now) if held else inf
         rests = now - max(account.stepped_at, account.changed_at, board.off_since)
-        saw = f"it rests at {place}, and STEPS says goals {goals}"
+        saw = f"it is at rest at {place}, but STEPS gives the goals {goals}"
         self.check(11, account.ticks_jumped or rests <= RESTS, now, account.name, saw)
 
     # -- the line --------------------------------------------------------------------------
@@ -271,32 +282,39 @@ class AnswerObserver(Judge):
             reported = tuple(int(row[column]) for column in _STEPS)
             if int(row["steps_ms"]) == NEVER:
                 self.check(
-                    11, not any(reported), now, name, f"steps {reported} that were never asked for"
+                    11,
+                    not any(reported),
+                    now,
+                    name,
+                    f"steps {reported} are reported, but were never requested",
                 )
                 continue
             at = now - int(row["steps_ms"]) / 1000.0
             near = [v for t, v in board.steps if at - UNDER_WAY <= t <= at + 0.2]
             saw = (
-                f"steps {reported} are reported, of {now - at:.2f} s ago, and it did not answer so"
+                f"steps {reported} are reported, of {now - at:.2f} s ago, but its reply was "
+                "different"
             )
             self.check(11, reported in near, now, name, saw)
             asked, answered = int(row["asked"]), int(row["answered"])
-            self.check(11, answered <= asked, now, name, f"{answered} answers to {asked} questions")
+            self.check(11, answered <= asked, now, name, f"{answered} replies to {asked} queries")
         self._numbers(status)
 
     def _numbers(self, message: ClusterStatus) -> None:
         """Check the values in a cluster's status, unless something near the cluster has failed."""
         remaining = message.lease_left
-        saw = f"{remaining:.2f} s are left of the plant's lease"
+        saw = f"{remaining:.2f} s of the plant's lease remain"
         self._calmly(LEASE_LEAST <= remaining <= LEASE_MOST, self._cluster, saw)
         off = message.utc_s - self.utc()
         self._calmly(-LATE <= off <= EARLY, self._cluster, f"its time is {off:+.2f} s off")
         cycle = message.cycle_s
-        saw = f"its second took {cycle:.2f} s"
+        saw = f"its one-second cycle took {cycle:.2f} s"
         self._calmly(0.0 < cycle <= CYCLE_MOST, self._cluster, saw)
-        saw = f"its safety table demands {', '.join(message.acts)}, and nothing has failed"
+        saw = f"its safety table demands {', '.join(message.acts)}, but nothing has failed"
         self._calmly(not message.acts, self._cluster, saw)
-        saw = f"the error of its time is {message.time_error_s} s, by {message.time_quality}"
+        saw = (
+            f"its time error is {message.time_error_s} s, with time quality {message.time_quality}"
+        )
         self._calmly(0.0 <= message.time_error_s < 1.0, self._cluster, saw)
 
 

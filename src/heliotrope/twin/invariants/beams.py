@@ -436,7 +436,7 @@ class BeamObserver(Judge):
         """Check that no heliostat tracks on a wrong sun direction or another's parameters."""
         node, own = mirror.node, mirror.board.outfit.items["armature"]
         foreign = node is not None and node.journal.items.get("armature") != own
-        by = "a sun that is contradicted" if self.contradicted else "another mirror's parameters"
+        by = "a contradicted sun position" if self.contradicted else "another mirror's parameters"
         # On its way to a target, its beam may reveal the sun position.
         points = [point for _, point in mirror.aims] or [RECEIVER]
         joins = self.contradicted and any(math.dist(point, RECEIVER) <= OFF for point in points)
@@ -484,8 +484,8 @@ class BeamObserver(Judge):
             losses.append((mirror.lost_at, mirror.lost_at + TOLD_WITHIN, "this mirror"))
         for lost_at, known_at, whose in losses:
             saw = (
-                f"{states.STATES[mirror.state]} {now - lost_at:.1f} s after a loss of {whose}, "
-                "without a person's command since"
+                f"{states.STATES[mirror.state]} {now - lost_at:.1f} s after the loss of "
+                f"{whose}, with no command from a person since"
             )
             # An order that was sent before the plant could know of the loss cannot be recalled.
             unknowing = mirror.called_at <= known_at
@@ -520,7 +520,7 @@ class BeamObserver(Judge):
         state, since = states.STATES[mirror.state], mirror.astray_since
         since = None if since is None else max(since, mirror.due_at)
         passed = 0.0 if since is None else now - since
-        where = "where nobody sent it" if not points else f"{miss:.1f} m beside where it was sent"
+        where = "where nobody sent it" if not points else f"{miss:.1f} m from where it was sent"
         beside = f"{state}, its beam {where} for {passed:.1f} s"
         unnamed = 0.0 if since is None else now - max(since, mirror.named_at)
         saw = f"{beside}, and no alarm names it"
@@ -593,7 +593,7 @@ class BeamObserver(Judge):
             if good or away:
                 self._proved[key] = float("inf")
                 good = True
-            saw = f"{order.act.name} is proven for it, and its beam or mirror is {saw}"
+            saw = f"{order.act.name} is reported as proven for it, but its beam or mirror is {saw}"
             self.check(15, good or now - begin <= DONE_WITHIN, now, mirror.name, saw)
 
     def _complete(self, order: EmergencyOrder, sun: FloatArray, now: float, *, holds: bool) -> None:
@@ -608,7 +608,7 @@ class BeamObserver(Judge):
             passed = 0.0 if mirror.shines_since is None else now - mirror.shines_since
             shines = f"and its beam has been on the receiver for {passed:.1f} s"
             if complete:
-                saw = f"every heliostat is said to have done {order.act.name}, {shines}"
+                saw = f"every heliostat is reported to have carried out {order.act.name}, {shines}"
                 self.check(15, passed <= DONE_WITHIN, now, mirror.name, saw)
             if holds and mirror.name in done:
                 saw = f"{order.act.name} is proven for it, {shines}"

@@ -176,7 +176,7 @@ class FluxObserver(Judge):
                 continue
             name = board.outfit.name
             point = plant.aims[plant.field.place(name)]
-            saw = f"it tracks at {point.round(2)} m, which nobody has given"
+            saw = f"it tracks a point at {point.round(2)} m that nobody has assigned"
             self.check(ORIGIN, self._known(name, point), now, name, saw)
 
     def _hold(self, excess: float, now: float) -> None:
@@ -203,7 +203,7 @@ class FluxObserver(Judge):
             return
         saw = (
             f"{1e-3 * rise.max():.3g} kW/m² more than {SUDDEN:g} s ago would heat a cell when the "
-            f"sky clears, for {passed:.0f} s; the ramp is {0.06 * aims.ramp:.3g} kW/m² a minute"
+            f"sky clears, for {passed:.0f} s; the ramp is {0.06 * aims.ramp:.3g} kW/m² per minute"
         )
         self.check(FLUX, passed <= AT_ONCE, now, self._receiver.name, saw)
 

@@ -84,9 +84,9 @@ SunAt = Callable[[float], FloatArray]
 
 #: Title of each invariant.
 TITLES = {
-    1: "no tracking on an old sun",
+    1: "no tracking with an outdated sun vector",
     2: "a heliostat that is cut off defocuses and stows",
-    3: "no way to tracking without a command",
+    3: "no tracking without a command",
     4: "DEFOCUS and STOW always, everything else by authority",
     5: "an old command moves nothing",
     6: "a damaged frame changes nothing",
@@ -100,13 +100,13 @@ TITLES = {
     14: "only a person resumes the field",
     15: "a proof counts only what is known",
     16: "work that is possible is done, and what is shown is true",
-    17: "what a person has ordered or locked stands",
-    18: "the true flux holds the limit",
+    17: "a person's orders and locks remain in force",
+    18: "the true flux stays within the limit",
     19: "each aim has an origin",
-    20: "what was taken is given back",
+    20: "whatever was taken is returned",
     21: "each ticket and each retry ends, truthfully",
     22: "every healthy mirror tracks again",
-    23: "what holds for safety outlives a restart",
+    23: "the state of safety survives a restart",
 }
 #: Numbers of the invariants about operators' orders and locks, the flux, and the origin of aims;
 #: numbers of the liveness invariants, which are called by name.
@@ -402,7 +402,7 @@ class Observer(Judge):
             saw = f"it sends SUN {age:.2f} s after the plant's last lease, limit {limit:.2f} s"
             self.check(self._lease_number(now, 2), age <= limit, now, "cluster", saw)
             dark = now - max(self._dark_since, self.disturbed_at)
-            saw = f"it sends SUN {dark:.1f} s after its time jumped, which nobody has acknowledged"
+            saw = f"it sends SUN {dark:.1f} s after a time jump that nobody has acknowledged"
             self.check(9, dark <= JUMP_SEEN or now < self._dark_since, now, "cluster", saw)
         elif sent.who in (messages.AUTHORITY, messages.KEY):
             self._authorised(sent, now)
@@ -423,10 +423,16 @@ class Observer(Judge):
             orders = [*orders, *self.orders.covering("PARAMETERS", addresses, now)]
         where = f"{sent.name} to {sent.to}"
         allowed = [order for order in orders if order.authorised]
-        self.check(4, bool(allowed), now, "cluster", f"{where} without an order of the authority")
+        self.check(
+            4,
+            bool(allowed),
+            now,
+            "cluster",
+            f"{where} without an order from the holder of the command authority",
+        )
         fresh = [order for order in allowed if now <= order.until]
         latest = max((order.until for order in allowed), default=0.0)
-        late = f"{where} {now - latest:.2f} s after its order has expired"
+        late = f"{where} {now - latest:.2f} s after its order expired"
         self.check(5, bool(fresh), now, "cluster", late)
         error = self.runs.obeyed((order.identity for order in fresh), now)
         self.check(4, not error, now, "cluster", f"{where}: {error}")
@@ -513,7 +519,7 @@ class Observer(Judge):
         if account.keep():
             sent = account.in_hand if heard else None
             by = sent is not None and (sent.who == messages.KEY or sent.name == "STANDBY")
-            saw = "its journal has changed without a message that sets anything"
+            saw = "its journal has changed without a message that changes settings"
             self.check(4, by, now, account.name, saw)
         if heard:
             account.in_hand = None
@@ -539,7 +545,7 @@ class Observer(Judge):
                 board.state not in ON_THE_WAY,
                 now,
                 name,
-                f"it is {state} after {what}, which anybody may send",
+                f"it is {state} after {what}, which anyone may send",
             )
         elif sent is not None and sent.addresses(account.address) and good:
             if sent.who not in (messages.ANYONE, messages.ASK):
@@ -563,11 +569,12 @@ class Observer(Judge):
             self._commanded(account, before, after, now, heard)
         if after in (states.TRACKING, states.SEARCHING):
             saw = (
-                f"from {states.STATES[before]} to {states.STATES[after]} without the way from stow"
+                f"from {states.STATES[before]} to {states.STATES[after]} without following the "
+                "path from stow"
             )
             self.check(10, account.by_way, now, account.name, saw)
         elif (before, after) == (states.APPROACHING, states.IDLE):
-            saw = f"its beam came to standby {account.foot:.1f} m beside the foot of the way"
+            saw = f"its beam reached standby {account.foot:.1f} m from the first point of the path"
             self.check(10, account.foot <= NEAR_FOOT, now, account.name, saw)
 
     def _commanded(
@@ -577,7 +584,7 @@ class Observer(Judge):
         sent = account.in_hand if heard else None
         name = sent.name if sent is not None else ""
         good = name in BY_COMMAND.get(after, ())
-        cause = name or ("bytes" if heard else "nothing but time")
+        cause = name or ("bytes" if heard else "nothing but the passage of time")
         saw = f"from {states.STATES[before]} to {states.STATES[after]} by {cause}"
         self.check(3, good, now, account.name, saw)
 
@@ -586,7 +593,7 @@ class Observer(Judge):
         if account.board.state in NEED_SUN:
             age = now - account.sun_at
             state = states.STATES[account.board.state]
-            saw = f"{state} with a sun of {age:.3f} s, lease {LEASE:g} s"
+            saw = f"{state} with a sun vector {age:.3f} s old, lease {LEASE:g} s"
             number = self._lease_number(now, 1)
             self.check(number, age <= LEASE + LOOK, now, account.name, saw)
 
@@ -702,7 +709,7 @@ class Observer(Judge):
             for account in self.accounts:
                 if account.name in message.heliostats:
                     reached = account.was_in(ASKED[order.name], order.at)
-                    saw = f"{order.name} of {account.name} is reported as done and never was"
+                    saw = f"{order.name} of {account.name} is reported as done, but never was"
                     self.check(11, reached, now, subject, saw)
 
     def on_status(self, status: ClusterStatus, names: Sequence[str], now: float) -> None:
@@ -718,7 +725,7 @@ class Observer(Judge):
             # The age counts from when the status was written. A status waits for a connection until
             # the next status is made, and may then be in transit for its lifetime.
             slack = 2.0 * STATUS_LIFE + AGE_ROUNDING
-            saw = f"its state is reported as {age:.2f} s old and is {now - last:.2f} s old"
+            saw = f"its state is reported as {age:.2f} s old, but is {now - last:.2f} s old"
             self.check(11, claimed <= last + slack, now, name, saw)
             rounding = AGE_ROUNDING + CLOCKS_APART * age
             of_then = [
@@ -727,7 +734,7 @@ class Observer(Judge):
                 if claimed - slack - rounding <= at <= claimed + rounding
             ]
             state = states.STATES[int(row["state"])]
-            saw = f"reported as {state} {age:.2f} s ago, which it did not answer then"
+            saw = f"reported as {state} {age:.2f} s ago, but its reply then was different"
             good = any(_row_of(values) == tuple(int(row[n]) for n in _TOLD) for values in of_then)
             self.check(11, good, now, name, saw)
 
@@ -736,7 +743,7 @@ class Observer(Judge):
     def look(self, now: float) -> None:
         """Check everything that must have happened by now."""
         for name, at in self._emergencies:
-            saw = f"{name} was ordered {now - at:.2f} s ago and is not on the bus"
+            saw = f"{name} was ordered {now - at:.2f} s ago, but has not been sent on the bus"
             self.check(4, now - at <= ORDER_WITHIN, now, "cluster", saw)
         self.orders.drop(now)
         self._reported(now)
@@ -755,7 +762,7 @@ class Observer(Judge):
                 continue
             names = {self._by_address[address].written for address in addresses} - {""}
             reported = any(names <= set(order.accepted) for order in orders)
-            saw = f"{where} went out {now - at:.1f} s ago and was never reported as accepted"
+            saw = f"{where} was sent {now - at:.1f} s ago, but was never reported as accepted"
             self.check(11, reported, now, "cluster", saw)
 
     def _counted(self, account: HeliostatAccount, now: float) -> None:
@@ -768,7 +775,7 @@ class Observer(Judge):
         for i in (0, 1):
             ordered = board.axes[i].emitted - board.slip[i]
             counted = motion.place(i)
-            saw = f"axis {i} counts {counted} steps, and {ordered} were ordered"
+            saw = f"axis {i} counts {counted} steps, but {ordered} were ordered"
             self.check(8, ordered == counted, now, account.name, saw)
 
     def _due(self, account: HeliostatAccount, sun: FloatArray, now: float, leased: bool) -> None:

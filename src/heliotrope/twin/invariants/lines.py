@@ -53,8 +53,8 @@ class LineObserver(Judge):
         if not (clear and connected):
             self._whole_since = now
         apart = now - self._apart_since
-        saw = f"nothing stands between it and the plant, and for {apart:.1f} s it has not rejoined"
+        saw = f"nothing separates it from the plant, but it has not reconnected for {apart:.1f} s"
         self.check(16, apart <= REJOINS_WITHIN, now, self._cluster, saw)
         age = now - max(self._leased_at, self._whole_since)
-        saw = f"the plant's last lease left {age:.1f} s ago, limit {LEASE_EVERY:g} s"
+        saw = f"the plant sent its last lease {age:.1f} s ago, limit {LEASE_EVERY:g} s"
         self.check(16, age <= LEASE_EVERY, now, self._cluster, saw)

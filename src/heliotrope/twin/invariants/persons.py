@@ -178,14 +178,14 @@ class PersonsObserver(Judge):
         for owner, (act, at) in self.orders.items():
             if now - at <= SHOWN_WITHIN:
                 continue
-            saw = f"{owner} ordered {act.name} {now - at:.1f} s ago and has not withdrawn it, and "
+            saw = f"{owner} ordered {act.name} {now - at:.1f} s ago and has not withdrawn it, but "
             self.check(WORDS, owner in shown, now, "plant", f"{saw}the plant names no such order")
             order = plant.sentinel.order
             holds = plant.sentinel.on and order is not None and order.act >= act
             does = f"{order.act.name} holds" if order and plant.sentinel.on else "none holds"
             self.check(WORDS, holds, now, "plant", f"{saw}{does}")
         for owner in shown:
-            saw = f"an emergency order of {owner} stands, which is withdrawn"
+            saw = f"an emergency order of {owner} is still active, although it was withdrawn"
             self.check(WORDS, owner in self.orders, now, "plant", saw)
 
     def _shown(self, plant: PlantController, now: float) -> None:
@@ -220,6 +220,6 @@ class PersonsObserver(Judge):
                 lock.place = azimuth, elevation
             return
         moved = max(abs(azimuth - lock.place[0]), abs(elevation - lock.place[1]))
-        saw = f"{states.STATES[board.state]}, {moved} steps from where it stood when it was locked "
+        saw = f"{states.STATES[board.state]}, {moved} steps from its position when it was locked "
         saw += f"by {', '.join(lock.owners)}"
         self.check(WORDS, moved <= STANDS, now, name, saw)

@@ -157,7 +157,7 @@ class PlantObserver(Judge):
     def granted(self, person: Person, token: int, now: float, *, seized: bool) -> None:
         """Check that the command authority was granted correctly."""
         before = self._live(now)
-        saw = f"{person.name} ({person.role.name.lower()}) was given the authority"
+        saw = f"{person.name} ({person.role.name.lower()}) was given the command authority"
         good = person.role >= Role.OPERATOR
         if before is not None:
             saw += f", which {before[0].name} had"
@@ -251,7 +251,7 @@ class PlantObserver(Judge):
         """Check a command that the plant has accepted."""
         holder = self._live(now)
         held = holder is not None and holder[:2] == (person, token)
-        saw = f"{what} by {person.name} was accepted without the authority"
+        saw = f"{what} by {person.name} was accepted without the command authority"
         self.check(4, held, now, "plant", saw)
         enough = person.role >= (Role.OPERATOR if what in _OPERATORS else Role.ENGINEER)
         saw = f"{what} was accepted from {person.name}, role {person.role.name.lower()}"
@@ -361,7 +361,7 @@ class PlantObserver(Judge):
         record = self._disk.records.get(identity)
         good = record is not None and record.what == what
         self.check(
-            11, good, now, "plant", f"{what} {message.identity} is sent before its record is kept"
+            11, good, now, "plant", f"{what} {message.identity} is sent before its record is stored"
         )
         if not isinstance(message, Command):
             return
@@ -451,7 +451,7 @@ class PlantObserver(Judge):
         # The plant says that it waits, and is believed for as long as turns may take.
         for identity in self._own.keys() & waits:
             since = self._own[identity][0]
-            saw = f"record {identity} has waited for its turn for {now - since:.0f} s"
+            saw = f"record {identity} has been waiting for {now - since:.0f} s"
             self.check(11, now - since <= TURN_WITHIN, now, "plant", saw)
             self._own[identity] = since, now
         well_since = max(self._disk.well_since, self._stood_at)
@@ -502,7 +502,7 @@ class PlantObserver(Judge):
                 del self._own[identity]
                 # A command that waited too long for the disk is not sent; its record says so.
                 given_up = "not sent" in self._disk.records[identity].result
-                saw = f"record {identity} belongs to nothing that was sent, and does not say so"
+                saw = f"record {identity} belongs to nothing that was sent, but does not say so"
                 self.check(11, given_up, now, "plant", saw)
 
     def _boards(self, now: float) -> None:
@@ -545,5 +545,5 @@ class PlantObserver(Judge):
             key = (order.ticket.identity, name)
             if key not in self._proved and order.is_done(name):
                 self._proved.add(key)
-                saw = f"{order.act.name} is proven for {name}, which has not left its beam"
+                saw = f"{order.act.name} is reported as proven for {name}, whose beam has not moved"
                 self.check(11, account.was_in(_OFF, order.at - YOUNGER), now, "plant", saw)

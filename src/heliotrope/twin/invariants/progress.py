@@ -220,18 +220,18 @@ class ProgressObserver(Judge):
                 now,
                 RAISED_WITHIN,
                 name,
-                "it has stood at stow",
+                "it has been at stow",
             )
             on_receiver = name in self._dark or board.miss(sun, RECEIVER) <= OFF
             tracks = board.state == states.TRACKING and on_receiver
-            saw = "automatic control has it, and it has not tracked the receiver"
+            saw = "it is under automatic control, but has not tracked the receiver"
             locked = name in self._locked and board.state == states.LOCKED
             rests = lit and board.state == states.IDLE
             away = mine and not (tracks or rests or locked)  # the person gives the lock back
             self._within(("tracks", name), away, now, TRACKS_WITHIN, name, saw, L3)
             for target in self._targets.values():
                 lights = mine and board.state == states.TRACKING and self._on(board, target, sun)
-                saw = f"no visit is under way, and its beam has been on {target.name}"
+                saw = f"no visit is under way, but its beam has been on {target.name}"
                 key = ("left", name, target.name)
                 self._within(key, lights, now, LEFT_WITHIN, name, saw)
         self._idle(operations, working, running, now)
@@ -259,7 +259,7 @@ class ProgressObserver(Judge):
                 ready &= operations.plant.beliefs.record(name) is None and name not in failed
             for place in self._targets:
                 free = ready and place not in busy
-                saw = f"{place} has been free, and it ready for a visit"
+                saw = f"{place} has been free, and the heliostat ready for a visit"
                 self._within(("idle", name, place), free, now, limit, name, saw)
 
     def _high(self, sun: FloatArray) -> bool:
@@ -275,7 +275,7 @@ class ProgressObserver(Judge):
         for name, board in self._boards.items():
             locked = board.state == states.LOCKED and name in quiet and not self._emergency
             locked &= name not in visited | self._locked and name not in self._out
-            saw = "no visit, person or emergency has it, and it has been LOCKED"
+            saw = "no visit, person or emergency holds it, but it has been LOCKED"
             self._within(("locked", name), locked, now, LOCKED_WITHIN, name, saw, L1)
 
     def _recalled(self, operations: Operations, now: float) -> None:
@@ -283,12 +283,15 @@ class ProgressObserver(Judge):
         on = operations.plant.sentinel.on
         if self._ended:
             self._ended = False
-            saw = "a person's emergency held when the last program ended, and the new one goes on"
+            saw = (
+                "a person's emergency was active when the last program ended, but the new "
+                "program continues"
+            )
             good = on or bool(operations.automatic.waits) or not self._called
             self.check(L4, good, now, "plant", saw)
             out = {lockout.name for lockout in operations.automatic.service.out}
             lost = sorted(self._out.keys() - out)
-            saw = f"a restart has put back in service: {', '.join(lost)}"
+            saw = f"a restart has returned to service: {', '.join(lost)}"
             self.check(L4, not lost, now, "plant", saw)
         self._emergency = on
 
@@ -304,7 +307,9 @@ class ProgressObserver(Judge):
             ends = {entry.heliostat: entry.outcome for entry in reversed(view.results)}
             off = all(ends.get(name) is CalibrationOutcome.REFUSED for name in names)
             saw = f"a person took the command authority {now - self._took_at:.1f} s ago, and "
-            saw += f"a visit of {', '.join(names)}, which nobody has touched, has broken off"
+            saw += (
+                f"a visit of {', '.join(names)}, whose heliostats nobody has commanded, was aborted"
+            )
             self.check(16, not (off and untouched >= set(names)), now, place, saw)
 
     def _step_finely(
@@ -319,7 +324,7 @@ class ProgressObserver(Judge):
                 board = self._boards[name]
                 photographed = board.state == states.TRACKING and self._on(board, target, sun)
                 rough = board.node is not None and board.node.controller.motion.rough > 0
-                saw = f"it is photographed on {run.target}, and steps roughly"
+                saw = f"it is being photographed on {run.target}, but is in rough stepping mode"
                 self.check(16, not (photographed and rough), now, name, saw)
 
     def _measures(
@@ -333,7 +338,9 @@ class ProgressObserver(Judge):
         last = max((result.at for result in results if result.new), default=0.0)
         fresh, self._measured = last > self._measured, max(last, self._measured)
         holds = may and bool(remaining and self._targets) and self._calibrates and not fresh
-        saw = f"{len(remaining)} heliostats are not calibrated, and no visit has measured any"
+        saw = (
+            f"{len(remaining)} heliostats are not calibrated, and no visit has measured any of them"
+        )
         self._within(("measured",), holds, now, MEASURED_WITHIN, "automatic control", saw)
 
     def _within(
@@ -374,5 +381,5 @@ class ProgressObserver(Judge):
             self._within(key, True, now, VISIT_WITHIN, run.heliostat, saw)
             for name in run.heliostats:
                 out_at = self._out.get(name, inf)
-                saw = f"it was taken out of service {now - out_at:.1f} s ago, and a visit begins"
+                saw = f"it was taken out of service {now - out_at:.1f} s ago, but a visit begins"
                 self.check(16, not (fresh and now - out_at > 1.0), now, name, saw)

@@ -52,7 +52,7 @@ GRANTED, CROSSING = 4.0, 3.0
 #: Reasons in a refusal, and how long an undisturbed period may have lasted by then, s: statuses
 #: arrive every second, and stored items are requested again after 30 s.
 UNHEARD_REASON, UNHEARD_FOR = "it has sent nothing since", 0.0
-UNCOMPARED_REASON, UNCOMPARED_FOR = "not been compared with the wanted", 45.0
+UNCOMPARED_REASON, UNCOMPARED_FOR = "not been compared with the intended", 45.0
 #: Reason of a refusal because of doubtful step counts, which is wrong if the counts are right.
 DOUBT_REASON = "step counts may be wrong"
 
@@ -272,7 +272,7 @@ class QuietObserver(Judge):
             good = calm <= UNCOMPARED_FOR
         elif DOUBT_REASON in reason:
             sure = now - mirror.sure_since
-            saw = f"refused: {reason}; it has been sure of them for {sure:.0f} s"
+            saw = f"refused: {reason}; its step counts have been certain for {sure:.0f} s"
             good = sure <= STATUS_EVERY
         self._refusals.append((mirror, good, saw))
 
@@ -374,7 +374,7 @@ class QuietObserver(Judge):
         saw = f"the last sun has reached it {age:.1f} s ago, limit {SUN_EVERY:g} s"
         self._calmly(age <= SUN_EVERY, now, mirror, saw)
         age = now - (account.statuses[-1][0] if account.statuses else -inf)
-        saw = f"its cluster has last heard its state {age:.1f} s ago, limit {STATUS_EVERY:g} s"
+        saw = f"its cluster last received its state {age:.1f} s ago, limit {STATUS_EVERY:g} s"
         self._calmly(age <= STATUS_EVERY, now, mirror, saw)
 
     def _told_off(self, mirror: _Mirror) -> float:
@@ -406,7 +406,7 @@ class QuietObserver(Judge):
             mirror.order = None
             return
         passed = now - order.done_at
-        saw = f"{order.name} was done {passed:.1f} s ago, and the plant has not been told"
+        saw = f"{order.name} was done {passed:.1f} s ago, but the plant has received no report"
         self._calmly(not order.identity or passed <= TOLD_WITHIN, now, mirror, saw)
 
     def _stays(self, mirror: _Mirror, before: int, now: float) -> None:
@@ -435,7 +435,7 @@ class QuietObserver(Judge):
             mirror.due_at = inf
         elif mirror.due_at == inf:
             mirror.due_at = now + slew(board, sun, goal)
-        saw = f"its beam is {miss:.2f} m beside its point, limit {limit:.2f} m"
+        saw = f"its beam is {miss:.2f} m from its point, limit {limit:.2f} m"
         self._calmly(miss <= limit or now < mirror.due_at, now, mirror, saw)
 
     def _proven(self, mirror: _Mirror, plant: PlantController, sun: FloatArray, now: float) -> None:
@@ -452,5 +452,5 @@ class QuietObserver(Judge):
             return
         mirror.off_since = now if mirror.off_since is None else mirror.off_since
         passed = now - max(mirror.off_since, order.at)
-        saw = f"{order.act.name} was done {passed:.1f} s ago, and is not proven for it"
+        saw = f"{order.act.name} was done {passed:.1f} s ago, but is not proven for it"
         self._calmly(passed <= PROVEN_WITHIN or order.is_done(mirror.name), now, mirror, saw)

@@ -181,15 +181,21 @@ class ResultObserver(Judge):
             account.result_version = version
         if begins:
             # Sightings are stored with the calibration that they result in.
-            saw = f"a new program knows calibration {version}, that before it {account.version}"
+            saw = (
+                f"the restarted program knows calibration {version}, but the one before knew "
+                f"{account.version}"
+            )
             self.check(16, version >= account.version, now, name, saw)
-            saw = f"a new program knows {count} sightings, that before it {account.kept}"
+            saw = (
+                f"the restarted program knows {count} sightings, but the one before knew "
+                f"{account.kept}"
+            )
             self.check(16, count >= account.kept or version == 0, now, name, saw)
             account.last, account.result_version, account.searched = count, version, 0
         elif count > account.kept and stored is not None:
             new = stored.sightings.take(np.arange(account.kept, count))
             self._photographs(name, new, stored.targets[account.kept :], now)
-        saw = f"the plant knows {count} sightings, and knew {account.kept}"
+        saw = f"the plant knows {count} sightings, but knew {account.kept} before"
         self.check(16, begins or count >= account.kept, now, name, saw)
         if account.before is None or begins:
             account.before = beliefs.present(name)
@@ -201,7 +207,7 @@ class ResultObserver(Judge):
         for k, target in enumerate(targets):
             at = float(new.time[k]) - self._zero
             away = float(np.linalg.norm(new.source[k] - self._sun(at)))
-            saw = f"a sighting has a sun {1e3 * away:.2f} mrad from the true one"
+            saw = f"a sighting has a sun direction {1e3 * away:.2f} mrad from the true one"
             self.check(16, away <= SUN_WITHIN, now, name, saw)
             own = [shot for shot in account.pictures if abs(shot.at - at) < SAME]
             if not own:
@@ -237,26 +243,26 @@ class ResultObserver(Judge):
         if entry.outcome in _BROKEN:
             return
         account.vain = 0 if entry.new else account.vain + 1
-        saw = f"{account.vain} visits in a row have brought nothing, the last: {entry.text}"
+        saw = f"{account.vain} visits in a row have had no result; the last: {entry.text}"
         self.check(L2, account.vain <= RETRIES, now, name, saw)
         missed = entry.outcome is CalibrationOutcome.NO_BEAM
         account.searched = account.searched + 1 if missed else 0
-        saw = f"its beam was searched for in vain {account.searched} times in a row"
+        saw = f"its beam was searched for without success {account.searched} times in a row"
         self.check(L2, account.searched <= SEARCHES, now, name, saw)
         if name not in self._dark:
             self._barren = [] if entry.new else [*self._barren, entry]
             count = len(self._barren)
-            saw = f"{count} results in a row have brought nothing, the last: {entry.text}"
+            saw = f"{count} results in a row have gained nothing; the last: {entry.text}"
             few = count < max(BARREN, len(self._boards) - 1)
             few |= _visits(self._barren) < BARREN_VISITS
             self.check(16, few or not self._together, now, name, saw)
-        saw = f"a result counts {entry.new} new sightings; {brought} came"
+        saw = f"a result counts {entry.new} new sightings, but there were {brought}"
         self.check(16, entry.new == brought, now, name, saw)
-        saw = f"a result counts {entry.sightings} sightings; {account.kept} are known"
+        saw = f"a result counts {entry.sightings} sightings, but {account.kept} are known"
         self.check(16, entry.sightings == account.kept, now, name, saw)
-        saw = f"a result is {entry.outcome.value}; calibration {version} is believed"
+        saw = f"a result is {entry.outcome.value}, but calibration {version} is in use"
         self.check(16, entry.good == new, now, name, saw)
-        saw = f"a result names calibration {entry.version}; {version} is believed"
+        saw = f"a result names calibration {entry.version}, but {version} is in use"
         self.check(16, entry.version == (version if new else 0), now, name, saw)
         if stored is None or before is None or brought == 0:
             return

@@ -44,8 +44,8 @@ class RunAccount:
         remaining = self._over.get(self._obeyed, now) - now
         if self._obeyed and self._obeyed not in runs and remaining > SLACK:
             return (
-                f"run {min(runs)} is obeyed while run {self._obeyed}, which was obeyed, has the "
-                f"lease for {remaining:.2f} s more"
+                f"run {min(runs)} is obeyed although run {self._obeyed}, which was obeyed "
+                f"before, still holds the lease for {remaining:.2f} s"
             )
         if len(runs) == 1:
             (self._obeyed,) = runs

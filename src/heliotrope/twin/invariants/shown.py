@@ -162,11 +162,11 @@ class ShownObserver(Judge):
                 continue
             self._judged.add(key)
             own = [act for act in self._acts if act[1] == row.who and act[2] in row.text]
-            saw = f"an event of {row.who}, who did nothing like it: {row.text}"
+            saw = f"an event names {row.who}, who did no such thing: {row.text}"
             self.check(11, bool(own), now, "logbook", saw)
             self._acts.remove(own[0])
         for at, who, word, _ in self._acts:
-            saw = f"{who} did {word!r} {now - at:.1f} s ago, and no event says so"
+            saw = f"{who} did {word!r} {now - at:.1f} s ago, but no event says so"
             self.check(11, now - at <= NOTED_WITHIN, now, "logbook", saw)
 
     def _rows(
@@ -178,17 +178,17 @@ class ShownObserver(Judge):
         now: float,
     ) -> None:
         fresh = frame.number > self._frame
-        self.check(11, frame.number >= self._frame, now, "frame", "its number falls")
+        self.check(11, frame.number >= self._frame, now, "frame", "its number decreases")
         self._frame = frame.number
         made = now if fresh else now - FRAME
         for row, name in enumerate(operations.names):
             age, state = float(frame.age[row]), int(frame.state[row])
             home = operations.plant.field.clusters[int(frame.cluster[row])]
-            saw = f"it is shown in {home}; it is in {self._homes[name]}"
+            saw = f"it is shown in {home}, but is in {self._homes[name]}"
             self.check(11, home == self._homes[name], now, name, saw)
             if now - self._changed.get(name, -inf) > FRAME:
                 held = bool(frame.held[row])
-                saw = f"it is shown as {'out of' if held else 'in'} service, and is not"
+                saw = f"it is shown as {'out of' if held else 'in'} service, but is not"
                 self.check(11, held == (name in self._out), now, name, saw)
             if state == STALE:
                 saw = f"it is shown as stale, {age:.1f} s old"
@@ -196,7 +196,7 @@ class ShownObserver(Judge):
                 self.check(11, not calm, now, name, saw)
                 continue
             reported = self._plant.reports(name, made - age - TRANSIT - FRAME)
-            saw = f"it is shown as {states.STATES[state]}; it has not reported that"
+            saw = f"it is shown as {states.STATES[state]}; it has not reported that state"
             self.check(11, state in reported, now, name, saw)
             if name in quiet:  # on a bad bus, replies are lost one after another
                 self._counted(name, frame.counts[row], made - age, now)
@@ -208,7 +208,7 @@ class ShownObserver(Judge):
         """Check that the displayed step counts occurred within the last seconds."""
         low, high = self._span(name, at)
         shown = ", ".join(str(int(count)) for count in counts)
-        saw = f"its counts are shown as {shown}; they were {low} to {high}"
+        saw = f"its counts are shown as {shown}, but were between {low} and {high}"
         self.check(11, bool(((counts >= low) & (counts <= high)).all()), now, name, saw)
 
     def _span(self, name: str, at: float) -> tuple[FloatArray, FloatArray]:
@@ -280,7 +280,9 @@ class ShownObserver(Judge):
                 continue
             own = _expected(operations, name, self._counts[name][-1][1][0], sun)
             said = float(frame.error[row])
-            saw = f"its predicted error is shown as {1e3 * said:.3f} mrad; it is {1e3 * own:.3f}"
+            saw = (
+                f"its predicted error is shown as {1e3 * said:.3f} mrad, but it is {1e3 * own:.3f}"
+            )
             good = not isfinite(own) or abs(said - own) <= SHARE * own
             self.check(11, good, now, name, saw)
 
@@ -292,18 +294,18 @@ class ShownObserver(Judge):
         head = operations.summary()
         total = sum(head.states.values())
         count = len(self._boards)
-        saw = f"{total} of {count} heliostats are counted in a state, {head.heliostats} in all"
+        saw = f"{total} of {count} heliostats are counted by state, but {head.heliostats} in total"
         self.check(11, total == count == head.heliostats, now, "summary", saw)
         holder = self._plant.holder(now)
-        saw = f"{head.holder or 'nobody'} is shown with the command authority; {holder} has it"
+        saw = f"{head.holder or 'nobody'} is shown with the command authority, but {holder} has it"
         self.check(11, holder is None or head.holder == holder, now, "summary", saw)
         rows = operations.logbook.alarms()
         still = sum(row.active or not row.acknowledged_by for row in rows)
-        saw = f"{head.alarms} alarms are counted, {still} shown"
+        saw = f"{head.alarms} alarms are counted, but {still} are shown"
         self.check(11, head.alarms == still, now, "summary", saw)
         for row in operations.logbook.cluster_rows(operations.plant):
             members = [name for name, home in self._homes.items() if home == row.name]
-            saw = f"{row.heliostats} heliostats are shown, {len(members)} are there"
+            saw = f"{row.heliostats} heliostats are shown, but there are {len(members)}"
             self.check(11, row.heliostats == len(members), now, row.name, saw)
             good = not isfinite(row.answered) or 0.0 <= row.answered <= 1.0
             self.check(11, good, now, row.name, f"it is shown to have answered {row.answered:.2f}")
@@ -328,7 +330,7 @@ class ShownObserver(Judge):
         if view.calibration is not None:
             for key, value in view.calibration.parameters.items():
                 shown = view.parameters.get(key)
-                saw = f"its parameter {key} is shown as {shown}; it is {value}"
+                saw = f"its parameter {key} is shown as {shown}, but is {value}"
                 self.check(11, shown is not None and shown.value == value, now, name, saw)
         saw = f"why it is out of service is shown as {view.hold!r}"
         self.check(11, bool(view.hold) == (name in self._out), now, name, saw)

@@ -107,5 +107,5 @@ class TicketObserver(Judge):
                 account = self._accounts[name]
                 reached = account.was_in(asked, at - _REPORTED)
                 reached = reached or (ticket.name == "STOW" and account.stands_at_stow())
-                saw = f"{ticket.name} of {name} is done; it is {states.STATES[account.state]}"
+                saw = f"{ticket.name} of {name} is done, but it is {states.STATES[account.state]}"
                 self.check(L2, reached, now, "plant", saw)

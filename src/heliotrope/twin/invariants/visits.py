@@ -138,17 +138,17 @@ class VisitObserver(Judge):
             spread = slope.T @ record.covariance @ slope + FLOOR**2 * np.eye(2)
             off = sideways @ ray
             deviations = float(np.sqrt(off @ np.linalg.solve(spread, off)))
-            saw = f"by the calibration that the plant believes its beam is {miss:.1f} m astray"
+            saw = f"by the calibration that the plant uses, its beam is {miss:.1f} m off target"
             self.check(12, miss <= ASTRAY, now, name, saw)
             if self._followed and name not in self._dark:
-                saw = f"its calibration misses by {deviations:.1f} of its own standard deviations"
+                saw = f"its calibration is wrong by {deviations:.1f} of its own standard deviations"
                 self.check(12, deviations <= DEVIATIONS, now, name, saw)
 
     def _dated(self, name: str, sightings: Sightings, now: float) -> None:
         """Check that sightings have the times of photographs, which determine their sun vectors."""
         for at in sightings.time:
             away = self._away(float(at))
-            saw = f"a sighting that the plant keeps is dated {away:.1f} s from any photograph"
+            saw = f"a sighting that the plant keeps is dated {away:.1f} s away from any photograph"
             self.check(16, away <= SAME_TIME, now, name, saw)
 
     def _own(self, board: Board, sightings: Sightings, now: float) -> None:

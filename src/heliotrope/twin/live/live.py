@@ -258,7 +258,7 @@ class World:
             cameras = [c for c in self.design.cameras if target.name in c.targets]
             if not cameras or cameras[0].position is None:
                 raise InputError(
-                    f"target {target.name}: no camera with a known position looks at it; add one "
+                    f"target {target.name}: no camera with a known position views it; add one "
                     "to the plant file, or take exact centroids"
                 )
             scenes.append(Scene(cameras[0], (target,)))

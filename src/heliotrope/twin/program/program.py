@@ -191,7 +191,7 @@ class TwinProgram:
 
     def _built(self) -> "_Parts":
         if self._parts is None:
-            raise FetchError("the simulated field has not begun")
+            raise FetchError("the simulated field has not started")
         return self._parts
 
     async def _lead(self, world: World, cameras: TwinCameras, loop: PacedLoop | None) -> None:

@@ -747,7 +747,7 @@ class Simulation:
                 for pod in self.pods:
                     pod.freeze(on=False)
             if self._tour is not None and self.plan.seconds >= TOUR_LENGTH:
-                saw = f"the tour is not over after {self.plan.seconds:g} s"
+                saw = f"the tour has not ended after {self.plan.seconds:g} s"
                 self.observer.check(11, self._tour.over, self._clock.monotonic(), "plant", saw)
             self.crash_plant(self._clock.monotonic())
             self.run_twice(group, on=False)
@@ -891,7 +891,7 @@ def shrink(outcome: RunResult, most: int = 60) -> RunResult:
     """
     if outcome.good:
         raise InputError(
-            f"seed {outcome.plan.seed}: nothing is broken, so there is nothing to shrink"
+            f"seed {outcome.plan.seed}: no invariant was broken, so there are no faults to reduce"
         )
     number = outcome.violation.number if outcome.violation is not None else 0
     seconds = min(outcome.plan.seconds, outcome.seconds + 1.0)

@@ -131,7 +131,7 @@ class Tour:
                 for alarm in self._plant.alarms
                 if alarm.active and alarm.condition not in EXPECTED
             ]
-            self._check(not alarms, f"an alarm where nothing fails: {alarms[:1]}")
+            self._check(not alarms, f"an alarm although nothing fails: {alarms[:1]}")
         await self._done("STOW", name, "STOWED")
         await self._done("APPROACH", name, "IDLE")
         await self._done("TRACK", name, "TRACKING")
@@ -218,7 +218,7 @@ class Tour:
             tracks = board.state == states.TRACKING
             point = points["AIM", name] if tracks else points.get(("STANDBY", name), STANDBY)
             miss, limit = self._miss(board, point), NEAR * _far(board, point) + NEAR_M
-            saw = f"{what} {name}: its beam is {miss:.2f} m beside its point, limit {limit:.2f} m"
+            saw = f"{what} {name}: its beam is {miss:.2f} m from its point, limit {limit:.2f} m"
             self._check(miss <= limit, saw, 12)
 
     def _miss(self, board: Board, point: Point) -> float:

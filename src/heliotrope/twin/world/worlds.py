@@ -13,27 +13,39 @@ from heliotrope.twin.boards.outfit import MACHINE, Outfit
 
 #: Everything that a run may add, with its meaning.
 WORLDS = {
-    "calm": "persons seldom take mirrors off the receiver",
-    "swarm": "each run draws its own weights of faults and of what persons do",
+    "calm": "people rarely take mirrors off the receiver",
+    "swarm": "each run draws its own weights of faults and of people's actions",
     "clock": "the clock of a cluster is wrong from the start, by a minute to an hour",
     "site": "the site of a cluster is wrong by up to 2.5 degrees of longitude or latitude",
     "addresses": "two boards of a cluster have exchanged addresses",
-    "frozen": "the programs of clusters and of the plant freeze for seconds to minutes and go on",
+    "frozen": (
+        "the programs of clusters and of the plant freeze for seconds to minutes, then continue"
+    ),
     "disk": "the disk of the plant's records is slow now and then",
-    "place": "date, hour, site, field and keep-out volumes are drawn; these lie across the ways",
-    "sensors": "wind and flux are measured, by sensors that lie now and then",
+    "place": (
+        "date, hour, site, field and keep-out volumes are drawn; the volumes lie across the "
+        "beams' paths"
+    ),
+    "sensors": "wind and flux are measured, by sensors that sometimes give false readings",
     "parameters": "boards store wrong parameters from the start",
-    "tour": "nothing fails, and each heliostat is led through all commands, which must be done",
-    "calibrations": "persons and beliefs change parameters, rightly or wrongly",
+    "tour": (
+        "nothing fails, and each heliostat is taken through all commands, and must carry them out"
+    ),
+    "calibrations": "people and beliefs change parameters, correctly or wrongly",
     "twice": "a second plant with the same keys runs for a while, on the same lines",
-    "visits": "automatic control raises and calibrates the field, by photographs that may lie",
-    "day": "automatic control meets the morning's or the evening's limit of the sun, at any place",
-    "lights": "as visits; lights stand on the targets for minutes, and most visits search no beam",
+    "visits": "automatic control raises and calibrates the field, by photographs that may mislead",
+    "day": (
+        "automatic control meets the sun's elevation limit in the morning or evening, at any site"
+    ),
+    "lights": (
+        "as visits; stray lights stay on the targets for minutes, and most visits do not "
+        "search for a beam"
+    ),
     "parties": "as visits, by the plant's own schedule: many at once on a target and the receiver",
-    "repairs": "boards, files and stores are exchanged for wrong ones, drives stall, persons lock",
+    "repairs": "boards, files and stores are replaced by wrong ones, drives stall, people lock",
     "common": "plant and clusters begin with the same wrong time, which a sun sensor contradicts",
     "limit": "automatic control aims under a flux limit, and often a ramp, while clouds pass",
-    "days": "as parties, from morning to evening stow: several persons act at any stage of a visit",
+    "days": "as parties, from morning to evening stow: several people act at any stage of a visit",
 }
 #: A short working day, and its length, s.
 DAYS, DAY = "days", 840.0
