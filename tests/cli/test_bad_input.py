@@ -385,7 +385,7 @@ ARGUMENTS: list[tuple[list[str], str]] = [
     (["evaluate", "NOWHERE"], "no such file"),
     (["evaluate", "PAINT", "--fraction", "0"], "--fraction must be a number from 0.01 to 0.999"),
     (["evaluate", "PAINT", "--model", "tilt_north,lean"], "lean"),
-    (["evaluate", "PAINT", "--prior", "tilt_north"], "write NAME=VALUE"),
+    (["evaluate", "PAINT", "--prior", "tilt_north"], "write NAME=SIGMA"),
     (["evaluate", "PAINT", "--prior", "tilt_north=-1"], "above 0"),
     (["calibrate", "PAINT", "--prior", "lean=0.01"], "lean"),
     (["evaluate", "PAINT", "--scheduler", "nowhere:1"], "no reply"),

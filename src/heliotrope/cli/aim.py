@@ -338,28 +338,33 @@ def _print_binding(chosen: "AimPlan") -> None:
     """Print where the limit binds, and the cells in which a higher limit would gain most."""
     import numpy as np
 
-    binding = chosen.binding
+    binding, over = chosen.binding, chosen.quantile / chosen.limit - 1.0
     count = int(binding.sum())
     line = f"{count:,} of {binding.size:,} cells {'at' if chosen.excess <= 0 else 'at or above'} "
+    line += "the limit"
     if not count:
-        print(f"{line}the limit")
+        closest = _cell(chosen, over.argmax())
+        print(f"{line}; the closest is {-100 * chosen.excess:.1f} % below it: {closest}")
         return
     rows, columns = (np.unique(indices) for indices in np.nonzero(binding))
-    print(
-        f"{line}the limit, in {_ranges('row', rows)} (0 is the lowest) and "
-        f"{_ranges('column', columns)}"
-    )
+    print(f"{line}, in {_ranges('row', rows)} (0 is the lowest) and {_ranges('column', columns)}")
     gain = np.where(binding, 1e-5 * chosen.limit * chosen.price, 0.0)
-    over = np.where(binding, chosen.quantile / chosen.limit - 1.0, -np.inf)
     priced = bool(gain.any())
     for k in np.argsort(-(gain if priced else over), axis=None)[: min(NAMED, count)]:
-        row, column = np.unravel_index(k, binding.shape)
-        # Adding 0 removes the sign from numbers that round to −0.
-        east, north, up = chosen.cells[row, column].round(1) + 0.0
-        text = f"a 1 % higher limit there adds about {gain[row, column]:.2g} kW"
+        text = f"a 1 % higher limit there adds about {gain.flat[k]:.2g} kW"
         if not priced:
-            text = f"{100 * over[row, column]:+.1f} % over the limit"
-        print(f"  row {row}, column {column} ({east:.1f}, {north:.1f}, {up:.1f} m): {text}")
+            text = f"{100 * over.flat[k]:+.1f} % over the limit"
+        print(f"  {_cell(chosen, k)}: {text}")
+
+
+def _cell(chosen: "AimPlan", k: "np.intp") -> str:
+    """Return the row, column and place of a cell as text."""
+    import numpy as np
+
+    row, column = np.unravel_index(k, chosen.limit.shape)
+    # Adding 0 removes the sign from numbers that round to −0.
+    east, north, up = chosen.cells[row, column].round(1) + 0.0
+    return f"row {row}, column {column} ({east:.1f}, {north:.1f}, {up:.1f} m)"
 
 
 def _ranges(noun: str, numbers: "npt.NDArray[np.intp]") -> str:
