@@ -349,8 +349,9 @@ def _print_binding(chosen: "AimPlan") -> None:
     rows, columns = (np.unique(indices) for indices in np.nonzero(binding))
     print(f"{line}, in {_ranges('row', rows)} (0 is the lowest) and {_ranges('column', columns)}")
     gain = np.where(binding, 1e-5 * chosen.limit * chosen.price, 0.0)
-    priced = bool(gain.any())
-    for k in np.argsort(-(gain if priced else over), axis=None)[: min(NAMED, count)]:
+    priced = np.count_nonzero(gain)
+    order = np.argsort(-(gain if priced else over), axis=None)
+    for k in order[: min(NAMED, priced or count)]:
         text = f"a 1 % higher limit there adds about {gain.flat[k]:.2g} kW"
         if not priced:
             text = f"{100 * over.flat[k]:+.1f} % over the limit"
@@ -363,8 +364,8 @@ def _cell(chosen: "AimPlan", k: "np.intp") -> str:
 
     row, column = np.unravel_index(k, chosen.limit.shape)
     # Adding 0 removes the sign from numbers that round to −0.
-    east, north, up = chosen.cells[row, column].round(1) + 0.0
-    return f"row {row}, column {column} ({east:.1f}, {north:.1f}, {up:.1f} m)"
+    east, north, up = chosen.cells[row, column].round(2) + 0.0
+    return f"row {row}, column {column} ({east:.2f}, {north:.2f}, {up:.2f} m)"
 
 
 def _ranges(noun: str, numbers: "npt.NDArray[np.intp]") -> str:
