@@ -19,6 +19,7 @@ from heliotrope.aims import (
     read_limit,
 )
 from heliotrope.aims.candidates import candidates, on_receiver
+from heliotrope.aims.errors import assess
 from heliotrope.aims.optimiser import bound, optimise
 from heliotrope.aims.scene_aims import deviation
 from heliotrope.errors import FormatError, InputError, UnknownNameError
@@ -424,3 +425,19 @@ def test_a_plant_is_aimed_and_what_it_cannot_do_is_refused(tmp_path: Any) -> Non
     two = (CYLINDER, PLATE)
     with pytest.raises(InputError, match="2 receivers, receiver, plate"):
         aim_scene(replace(field(5), surfaces=two), Demand(FluxLimit(1e6)))
+
+
+def test_cells_with_more_room_ask_for_less_than_cells_that_are_all_at_their_limit(
+    scene: Scene,
+) -> None:
+    own = np.tile(9e-8 * np.eye(2), (300, 1, 1))
+    engine = FieldFlux(replace(scene, mirrors=replace(scene.mirrors, pointing=own)))
+    modes, groups, flux = np.zeros((300, 5, 2)), np.arange(300), engine.maps[0]
+    sigma = assess(engine, modes, groups, 0.99, flux).sigma
+    even = assess(engine, modes, groups, 0.99, flux + 3.0 * sigma).factor
+    room = np.full(flux.shape, 2.0)
+    room[np.unravel_index(flux.argmax(), flux.shape)] = 0.0
+    one = assess(engine, modes, groups, 0.99, flux + (3.0 + room) * sigma).factor
+    # 99 % of a normal variable lie below 2.33 standard deviations.
+    assert 2.1 < one < 2.6
+    assert 3.2 < even < 4.5

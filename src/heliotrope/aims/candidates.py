@@ -10,7 +10,7 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.optics.beam import SUN_SIGMA
 from heliotrope.optics.receiver_flux import FieldFlux, Images
-from heliotrope.optics.scene import Scene
+from heliotrope.optics.scene import Mirrors, Scene
 from heliotrope.optics.shading import IntArray
 from heliotrope.optics.surfaces import Cylinder, Plate
 from heliotrope.parallel import run_blocks
@@ -141,19 +141,23 @@ def _across(scene: Scene, offset: FloatArray) -> FloatArray:
     return as_float(surface.center + surface.radius * surface.outward(angle))
 
 
+def widths(mirrors: Mirrors) -> FloatArray:
+    """Return the beams' standard deviations at the receiver, m, (H,)."""
+    angle = SUN_SIGMA**2 + 4.0 * mirrors.slope**2
+    angle = angle + 0.5 * np.trace(mirrors.pointing, axis1=1, axis2=2)
+    return as_float(mirrors.slant * np.sqrt(angle))
+
+
 def regions(scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the beams' standard deviations at the receiver, and how far aims may be displaced.
 
     The displacements are to either side and up or down from `middles`; all three are in m, (H,).
     """
-    surface, mirrors = surface_in(scene), scene.mirrors
-    angle = SUN_SIGMA**2 + 4.0 * mirrors.slope**2
-    angle = angle + 0.5 * np.trace(mirrors.pointing, axis1=1, axis2=2)
-    width = as_float(mirrors.slant * np.sqrt(angle))
+    surface, width = surface_in(scene), widths(scene.mirrors)
     room = np.maximum(0.5 * surface.height - WITHIN * width, 0.0)
     if isinstance(surface, Plate):
         return width, np.maximum(0.5 * surface.width - WITHIN * width, 0.0), room
-    return width, np.full(len(mirrors), ASIDE * surface.radius), room
+    return width, np.full(len(width), ASIDE * surface.radius), room
 
 
 def axis_of(surface: Plate | Cylinder) -> FloatArray:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from heliotrope.aims.candidates import widths
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, normalize, reflect
 from heliotrope.optics.receiver_flux import FieldFlux
@@ -110,8 +111,8 @@ class Risk:
     sigma
         Standard deviation of each cell's flux, W/m², (rows, columns).
     factor
-        With the chosen probability, no cell exceeds its expected flux by more than this many
-        standard deviations.
+        If the tightest cell is this many standard deviations below its limit, all cells keep
+        their limits with the chosen probability.
     own
         Standard deviation due to the mirrors' own errors alone, W/m², (rows, columns).
     """
@@ -132,7 +133,6 @@ def assess(
     groups: IntArray,
     probability: float,
     limit: FloatArray,
-    width: float,
 ) -> Risk:
     """Return the uncertainty of the flux in a scene.
 
@@ -148,8 +148,6 @@ def assess(
         Probability that the limit holds in all cells at once, 0.5 to 0.9999.
     limit
         W/m², (rows, columns).
-    width
-        Standard deviation of a typical beam, in cells; errors of cells this close are correlated.
     """
     flux = engine.maps[0]
     pointing = engine.scene.mirrors.pointing
@@ -165,9 +163,13 @@ def assess(
     near = near[:: -(-len(near) // LOOKED)]
     rng, cells = np.random.default_rng(0), np.stack(np.unravel_index(near, flux.shape), axis=-1)
     off = rng.standard_normal((DRAWS, len(parts))) @ parts.reshape(len(parts), flux.size)[:, near]
-    off += np.sqrt(own).ravel()[near] * _alike(rng, as_float(cells), width)
-    scale = np.maximum(sigma, 1e-300)
-    factor = max(float(np.quantile((off / scale.ravel()[near]).max(axis=1), probability)), 0.0)
+    off += np.sqrt(own).ravel()[near] * _alike(rng, as_float(cells), _reach(engine))
+    scale = np.maximum(sigma, 1e-300).ravel()[near]
+    # Cells that have more room than the tightest one may exceed their expectation by more.
+    room = (limit - flux).ravel()[near] / scale
+    factor = max(
+        float(np.quantile((off / scale - room).max(axis=1), probability) + room.min()), 0.0
+    )
     return Risk(sigma, factor, as_float(np.sqrt(own)))
 
 
@@ -190,6 +192,23 @@ def gains(engine: FieldFlux, risk: Risk, prices: FloatArray) -> FloatArray:
         return np.zeros(count)
     groups = np.arange(count) * 64 // count
     return engine.spread(engine.scene.mirrors.pointing, np.zeros((count, 0, 2)), groups, worth)[2]
+
+
+def _reach(engine: FieldFlux) -> float:
+    r"""Return how far apart cells with correlated own errors are, in cells.
+
+    A mirror with the beam power P, whose error displaces its image of width w by s, has a share
+    proportional to $P^2 s^2 / w^6$ in the variance of a cell, and neighbouring cells have the mean
+    square slope that belongs to the mean of $1 / w^2$ with these shares.
+    """
+    mirrors = engine.scene.mirrors
+    wide = widths(mirrors)
+    moved = mirrors.slant**2 * np.trace(mirrors.pointing, axis1=1, axis2=2)
+    share = engine.power**2 * moved / wide**6
+    if not share.any():
+        share = np.ones_like(wide)
+    area = float(np.mean(engine.scene.surfaces[0].cells.area))
+    return float(np.sqrt(share.sum() / (share / wide**2).sum() / area))
 
 
 def _alike(rng: np.random.Generator, cells: FloatArray, width: float) -> FloatArray:

@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.aims.candidates import middles, surface_in
-from heliotrope.aims.errors import Risk, assess
-from heliotrope.aims.scene_aims import Demand, SceneAims, aim_scene
+from heliotrope.aims.scene_aims import Demand, SceneAims, aim_scene, risk_of
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.optics.receiver_flux import FieldFlux, Images
@@ -230,7 +229,7 @@ def next_round(now: Round, **light: Any) -> Answer:
         if not (problem := _kept(now, fixed, limit)):
             raise
     engine = FieldFlux(_posed(now.scene, now.aims), **light)
-    above = _risk(engine, now.demand, room).above
+    above = risk_of(engine, now.demand, room).above
     power = engine.powers[0]
     better = power if best is None else best.engine.powers[0]
     more = above if best is None else np.maximum(above, best.risk.above)
@@ -246,7 +245,7 @@ def next_round(now: Round, **light: Any) -> Answer:
     if full or better > (1.0 + BETTER) * power or not now.free[_aimed(now.aims)].all():
         moves, remaining, waiting = steps(now, target_aims, as_float(cap), limit_cap, light)
     shown = FieldFlux(_posed(now.scene, np.where(now.shining[:, None], now.aims, np.nan)), **light)
-    risk = _risk(shown, now.demand, limit)
+    risk = risk_of(shown, now.demand, limit)
     safe = _safe(now, room, light)
     unlit = now.free & (best is not None and best.field.power.max(axis=1) <= 0.0)
     return Answer(
@@ -289,7 +288,9 @@ def heat(scene: Scene, demand: Demand, aims: FloatArray, **light: Any) -> Heat:
     if not _aimed(aims).any():
         return Heat(np.zeros_like(limit), np.zeros_like(limit), limit, 0.0)
     engine = FieldFlux(_posed(scene, aims), **light)
-    return Heat(engine.maps[0], _risk(engine, demand, limit).above, limit, float(engine.powers[0]))
+    return Heat(
+        engine.maps[0], risk_of(engine, demand, limit).above, limit, float(engine.powers[0])
+    )
 
 
 def _room(now: Round, limit: FloatArray, light: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
@@ -302,7 +303,7 @@ def _room(now: Round, limit: FloatArray, light: dict[str, Any]) -> tuple[FloatAr
     if _aimed(now.fixed).any():
         engine = FieldFlux(_posed(now.scene, now.fixed), **light)
         fixed = engine.maps[0]
-        room = limit - fixed - _risk(engine, now.demand, limit).above
+        room = limit - fixed - risk_of(engine, now.demand, limit).above
     return fixed, as_float(np.maximum(room, LEAST * limit))
 
 
@@ -526,25 +527,12 @@ def _safe(now: Round, room: FloatArray, light: dict[str, Any]) -> FloatArray:
     while share > 0.5 / len(now.free):
         aims = np.where((now.free & (turn < share))[:, None], now.spread, np.nan)
         engine = FieldFlux(_posed(now.scene, aims), **light)
-        over = (engine.maps[0] + _risk(engine, now.demand, room).above) / room
+        over = (engine.maps[0] + risk_of(engine, now.demand, room).above) / room
         most = float(over.max())
         if most <= 1.0:
             return as_float(aims)
         share *= min(THINNER, 1.0 / most)
     return np.full(now.aims.shape, np.nan)
-
-
-def _risk(engine: FieldFlux, demand: Demand, limit: FloatArray) -> Risk:
-    """Return the uncertainty of the flux."""
-    mirrors, shining = engine.scene.mirrors, engine.leaving > 0.0
-    if not shining.any() or not (mirrors.pointing.any() or demand.shared.any):
-        return Risk(np.zeros_like(limit), 0.0, np.zeros_like(limit))
-    groups = np.zeros(len(shining), dtype=np.int64) if demand.groups is None else demand.groups
-    modes = demand.shared.modes(mirrors, engine.scene.sun, demand.pole)
-    surface = surface_in(engine.scene)
-    cell = np.sqrt(surface.cells.area[0])
-    wide = float(np.median(mirrors.slant)) * 5e-3 / float(cell)
-    return assess(engine, modes, groups, demand.probability, limit, wide)
 
 
 def _posed(scene: Scene, aims: FloatArray) -> Scene:

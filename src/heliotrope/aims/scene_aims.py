@@ -362,19 +362,18 @@ def _evaluated(
     off = choice.choice < 0
     aims = np.where(off[:, None], middles(scene), field.aims[rows, np.maximum(choice.choice, 0)])
     engine = FieldFlux(_posed(scene, aims, off), **light)
-    risk = _risk(engine, field, demand, limit)
+    risk = risk_of(engine, demand, limit)
     return SceneAims(engine, field, choice, aims, off, _dark(scene), limit, risk, light)
 
 
-def _risk(engine: FieldFlux, field: Candidates, demand: Demand, limit: FloatArray) -> Risk:
-    """Return the uncertainty of the flux."""
+def risk_of(engine: FieldFlux, demand: Demand, limit: FloatArray) -> Risk:
+    """Return the uncertainty of the flux under a limit (rows, columns)."""
     scene, mirrors = engine.scene, engine.scene.mirrors
-    if not (mirrors.pointing.any() or demand.shared.any):
+    if not (engine.leaving.any() and (mirrors.pointing.any() or demand.shared.any)):
         return Risk(np.zeros_like(limit), 0.0, np.zeros_like(limit))
     groups = np.zeros(len(mirrors), dtype=np.int64) if demand.groups is None else demand.groups
     modes = demand.shared.modes(mirrors, scene.sun, demand.pole)
-    width = float(np.median(field.width)) / np.sqrt(field.images.area)
-    return assess(engine, modes, groups, demand.probability, limit, width)
+    return assess(engine, modes, groups, demand.probability, limit)
 
 
 def _ascended(
@@ -392,7 +391,7 @@ def _ascended(
     start = np.stack([np.zeros(len(up)), up * surface.height / surface.shape[0]], axis=-1)
 
     def cap_of(engine: FieldFlux) -> FloatArray:
-        above = _risk(engine, field, demand, limit).above
+        above = risk_of(engine, demand, limit).above
         return as_float(np.maximum(limit - above, LEAST * limit))
 
     aims, prices = ascend(scene, cap_of, start, progress, **light)
@@ -401,7 +400,7 @@ def _ascended(
     power = float(field.power[rows, chosen].sum())
     choice = Choice(chosen, np.ascontiguousarray(prices.T), field.flux(chosen), power, np.nan)
     engine = FieldFlux(_posed(scene, aims, None), **light)
-    off, risk = np.zeros(len(rows), dtype=np.bool_), _risk(engine, field, demand, limit)
+    off, risk = np.zeros(len(rows), dtype=np.bool_), risk_of(engine, demand, limit)
     return SceneAims(engine, field, choice, aims, off, _dark(scene), limit, risk, light)
 
 

@@ -354,7 +354,8 @@ def _print_binding(chosen: "AimPlan") -> None:
     for k in order[: min(NAMED, priced or count)]:
         text = f"a 1 % higher limit there adds about {gain.flat[k]:.2g} kW"
         if not priced:
-            text = f"{100 * over.flat[k]:+.1f} % over the limit"
+            side = "above" if over.flat[k] > 0.0 else "below"
+            text = f"{100 * abs(over.flat[k]):.1f} % {side} the limit"
         print(f"  {_cell(chosen, k)}: {text}")
 
 
