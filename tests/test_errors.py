@@ -2,7 +2,7 @@
 
 import pytest
 
-from heliotrope.errors import once
+from heliotrope.errors import FormatError, once
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.volumes import around
 from heliotrope.safety import alarms
@@ -20,6 +20,13 @@ from heliotrope.safety import alarms
 )
 def test_a_kind_that_a_name_repeats_stands_once(text: str, said: str) -> None:
     assert once(text) == said
+
+
+def test_a_place_in_a_file_stands_once() -> None:
+    error = FormatError("plant.toml", "aims: moves must be 1 or more", "aims")
+    assert str(error) == "plant.toml: aims: moves must be 1 or more"
+    assert error.problem == "moves must be 1 or more"
+    assert str(FormatError("a.csv", "east: empty", "line 1")) == "a.csv: line 1: east: empty"
 
 
 def test_alarms_and_volumes_name_no_receiver_receiver() -> None:

@@ -81,6 +81,8 @@ class FormatError(InputError):
     def __init__(self, path: object, problem: str, where: str = "") -> None:
         self.path = str(path)
         self.where = where
+        # A problem that already begins with its place would name it twice.
+        problem = problem.removeprefix(f"{where}: ") if where else problem
         self.problem = problem
         place = f"{self.path}: {where}" if where else self.path
         super().__init__(f"{place}: {problem}")

@@ -400,6 +400,30 @@ def test_maps_are_resampled_to_the_least_and_files_are_read_from_the_top(tmp_pat
         FluxLimit(1e5, 0.9)
 
 
+def test_prices_say_what_a_higher_limit_would_add() -> None:
+    plant, sun = lay_out("radial", 200), [0.1, -0.5, 0.85]
+    middle = ht.aim(plant, sun=sun, limit=6e7, strategy="middle", cells=(12, 12))
+    assert not middle.price.any()
+    low = ht.aim(plant, sun=sun, limit=0.1 * middle.light.peak, cells=(12, 12))
+    more = 0.05 * float((low.limit * low.price).sum())
+    limit = 0.105 * middle.light.peak
+    high = ht.aim(plant, sun=sun, limit=limit, start=low, cells=(12, 12))
+    assert 0.7 * more < high.power - low.power < 1.4 * more
+    assert low.cells.shape == (*low.price.shape, 3)
+    assert (np.diff(low.cells[..., 2], axis=0) > 0.0).all()
+    np.testing.assert_array_equal(low.binding, low.quantile > 0.99 * low.limit)
+
+
+def test_a_map_in_kw_gets_a_hint_of_the_unit() -> None:
+    hint = "no cell's limit is above 700 W/m², which is very low; if the numbers were meant as "
+    hint += "kW/m², multiply them by 1,000"
+    assert FluxLimit([[600.0, 700.0]]).unit_hint == hint
+    assert FluxLimit([[600.0, 1e4]]).unit_hint == ""
+    assert FluxLimit(700.0).unit_hint == ""
+    with pytest.raises(InputError, match=rf"raise the limit there to .* kW/m²; {hint}$"):
+        ht.aim(ht.example_plant(), sun=[0.1, 0.6, 0.8], limit=[[600.0, 700.0]], cells=(12, 12))
+
+
 def test_a_plant_is_aimed_and_what_it_cannot_do_is_refused(tmp_path: Any) -> None:
     plant, sun = ht.example_plant(), [0.1, 0.6, 0.8]
     middle = ht.aim(plant, sun=sun, limit=1e6, strategy="middle", cells=(12, 12))

@@ -385,7 +385,7 @@ ARGUMENTS: list[tuple[list[str], str]] = [
     (["evaluate", "NOWHERE"], "no such file"),
     (["evaluate", "PAINT", "--fraction", "0"], "--fraction must be a number from 0.01 to 0.999"),
     (["evaluate", "PAINT", "--model", "tilt_north,lean"], "lean"),
-    (["evaluate", "PAINT", "--prior", "tilt_north"], "write NAME=VALUE"),
+    (["evaluate", "PAINT", "--prior", "tilt_north"], "write NAME=SIGMA"),
     (["evaluate", "PAINT", "--prior", "tilt_north=-1"], "above 0"),
     (["calibrate", "PAINT", "--prior", "lean=0.01"], "lean"),
     (["evaluate", "PAINT", "--scheduler", "nowhere:1"], "no reply"),
@@ -419,6 +419,28 @@ def test_arguments(arguments, says, tmp_path, capsys, monkeypatch) -> None:  # t
     captured = capsys.readouterr()
     _one_line(captured.err)
     assert says in captured.err
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        (("flux",), "specify --site LATITUDE,LONGITUDE,HEIGHT"),
+        (("aim", "--limit=100"), "specify --site LATITUDE,LONGITUDE,HEIGHT"),
+        (("standby",), "use a file that contains its site, such as a plant file (TOML)"),
+        (("glare",), "use a file that contains its site, such as a plant file (TOML)"),
+    ],
+    ids=lambda given: given[0] if isinstance(given, tuple) else "",
+)
+def test_a_layout_without_a_site_gets_advice_that_the_command_knows(  # type: ignore[no-untyped-def]
+    command, says, tmp_path, capsys, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("bare.csv").write_text("x,y,z\n10,50,0\n-10,50,0\n", encoding="utf-8")
+    assert _run([command[0], "bare.csv", *command[1:]], monkeypatch) == 2
+    line = capsys.readouterr().err
+    _one_line(line)
+    begin = "heliotrope: bare.csv: a table of positions contains no site, so the sun cannot be "
+    assert line == f"{begin}computed; {says}\n"
 
 
 def test_the_table_is_long_enough() -> None:

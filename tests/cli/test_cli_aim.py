@@ -12,6 +12,7 @@ import pytest
 
 import heliotrope as ht
 from heliotrope.cli import main
+from heliotrope.cli.aim import _ranges
 
 WORDS = ("--sun=0.1,0.6,0.8", "--cells=10x12")
 
@@ -55,6 +56,77 @@ def test_json_keeps_the_limit_of_a_file(aim: Any) -> None:
     assert (flux <= limit).all()
     assert got["strategies"][0]["excess"] <= 0.0
     assert len(got["heliostats"]) == 18
+
+
+def test_the_map_has_flux_and_limit_of_each_cell(aim: Any) -> None:
+    Path("limit.csv").write_text("90000,90000\n140000,140000\n", encoding="utf-8")
+    words = ("--limit=limit.csv", "--margin=0", "--strategy=middle")
+    code, out, err = aim(*words, "--map=m.csv")
+    assert code == 0, err
+    assert "map: m.csv" in out
+    with Path("m.csv").open(encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    got = json.loads(aim(*words, "--json")[1])
+    assert len(rows) == 120
+    for row in rows:
+        cell = int(row["row"]), int(row["column"])
+        for name in ("flux", "quantile", "limit"):
+            value = 1e-3 * np.array(got[f"{name}_w_m2"])[cell]
+            assert float(row[f"{name}_kw_m2"]) == pytest.approx(value, abs=1e-4)
+        assert (row["binds"] == "yes") == got["binding"][cell[0]][cell[1]]
+        assert (float(row["limit_kw_m2"]) == 90.0) == (cell[0] >= 5)
+    up = {int(row["row"]): float(row["up_m"]) for row in rows}
+    assert all(up[k] < up[k + 1] for k in range(9))
+    assert {row["binds"] for row in rows} == {"yes", "no"}
+    power = sum(float(row["area_m2"]) * float(row["flux_kw_m2"]) for row in rows)
+    assert power == pytest.approx(1e-3 * got["strategies"][0]["power_w"], rel=2e-3)
+
+
+def test_the_places_where_the_limit_binds_are_printed(aim: Any) -> None:
+    code, out, err = aim("--limit=60", "--strategy=middle")
+    assert code == 0, err
+    got = json.loads(aim("--limit=60", "--strategy=middle", "--json")[1])
+    binding, over = np.array(got["binding"]), np.array(got["quantile_w_m2"])
+    rows, columns = np.nonzero(binding)
+    assert f"{binding.sum()} of 120 cells at or above the limit, in rows {rows.min()} to " in out
+    assert f"columns {columns.min()} to {columns.max()}\n" in out
+    row, column = np.unravel_index(over.argmax(), over.shape)
+    share = 100.0 * (over.max() / np.max(got["limit_w_m2"]) - 1.0)
+    lines = [line for line in out.splitlines() if line.startswith("  row ")]
+    assert len(lines) == 5
+    assert lines[0].startswith(f"  row {row}, column {column} (")
+    assert lines[0].endswith(f" m): {share:.1f} % above the limit")
+    code, out, err = aim("--limit=9000", "--strategy=middle")
+    assert code == 0, err
+    below = 100.0 * (1.0 - 1e-3 * over.max() / (0.99 * 9000.0))
+    line = f"0 of 120 cells at the limit; the closest is {below:.1f} % below it: row {row}, column "
+    assert f"{line}{column} (" in out
+    assert "  row " not in out
+
+
+def test_a_limit_file_in_kw_gets_a_hint_of_the_unit(aim: Any) -> None:
+    Path("limit.csv").write_text("120,120\n140,140\n", encoding="utf-8")
+    code, out, err = aim("--limit=limit.csv", "--strategy=middle", "--json")
+    assert code == 0
+    assert json.loads(out)["limit_w_m2"][0][0] == pytest.approx(0.99 * 140.0)
+    assert err == (
+        "heliotrope: limit.csv: no cell's limit is above 140 W/m², which is very low; if the "
+        "numbers were meant as kW/m², multiply them by 1,000\n"
+    )
+    Path("limit.csv").write_text("120,120\n10000,140\n", encoding="utf-8")
+    assert aim("--limit=limit.csv", "--strategy=middle")[::2] == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "text"),
+    [
+        ([3], "row 3"),
+        ([0, 1, 2, 5, 9], "rows 0 to 2, 5, 9"),
+        ([0, 2, 4, 6, 7], "rows 0 to 7"),
+    ],
+)
+def test_ranges_are_few(numbers: list[int], text: str) -> None:
+    assert _ranges("row", np.array(numbers)) == text
 
 
 def test_a_uniform_flux_and_a_ramp_are_told(aim: Any) -> None:
@@ -118,6 +190,9 @@ def test_lost_heliostats_and_clusters_send_no_light(aim: Any) -> None:
         rows = list(csv.DictReader(lines))
     assert {row["heliostat"] for row in rows if row["state"] == "lost"} == gone
     assert not any(float(row["power_kw"]) or row["up_m"] for row in rows if row["state"] == "lost")
+    code, out, err = aim("--limit=120", f"--without={name}")
+    assert code == 0, err
+    assert f"1 heliostat is lost: {name}\n" in out
 
 
 def test_with_two_receivers_each_heliostat_counts_for_its_own(aim: Any) -> None:

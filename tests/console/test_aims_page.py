@@ -110,11 +110,11 @@ def test_ctl_prints_what_the_page_shows(limited: None, ctl: Callable[..., str]) 
         ),
         "161 kW of 166 kW with the best aims",
         (
-            "5 heliostats have an aim, 1 are at standby without one, 4 wait for the ramp, "
-            "2 still have to move"
+            "heliostats: 5 with an aim, 1 at standby without one, 4 waiting for the ramp, "
+            "2 still to move"
         ),
-        "1 are aimed by an operator and stay: P0004A",
-        "1 reach no cell of the receiver: P0003A",
+        "1 aimed by an operator and kept: P0004A",
+        "1 reaching no cell of the receiver: P0003A",
         "2 moved 12 s ago: P0001A, P0002A",
     ]
     told = json.loads(ctl("--json"))

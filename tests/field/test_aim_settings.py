@@ -9,7 +9,7 @@ import pytest
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.aim_settings import AimSettings
 from heliotrope.field.flux_limit import FluxLimit
-from heliotrope.field.formats.plant_file import read_plant, write_plant
+from heliotrope.field.formats.plant_file import check_plant, read_plant, write_plant
 from heliotrope.field.layouts import lay_out
 
 NUMBER = AimSettings("limit", FluxLimit(6e5, 0.1), probability=0.95, drift=2e-4, moves=12.0)
@@ -38,6 +38,19 @@ def test_a_map_stands_beside_the_plant_file(tmp_path: Path) -> None:
     read = read_plant(tmp_path / "plant.toml").aims
     assert read.limit is not None
     np.testing.assert_array_equal(read.limit.flux, flux)
+
+
+def test_a_map_in_kw_is_a_warning_of_the_check(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    for flux, number in ((np.array([[600.0, 550.0]]), 1), (np.array([[6e5, 550.0]]), 0)):
+        settings = AimSettings("limit", FluxLimit(flux), "limit.csv")
+        write_plant(replace(lay_out("radial", 6), aims=settings), path)
+        findings = check_plant(path)
+        texts = [f.text for f in findings if "kW/m²" in f.text]
+        assert len(texts) == number
+        begin = "aims: plant.limit.csv: no cell's limit is above 600 W/m²"
+        assert all(text.startswith(begin) for text in texts)
+        assert {f.severity for f in findings} <= {"warning"}
 
 
 def test_a_table_is_read_with_its_panels_and_kept_as_a_map(tmp_path: Path) -> None:
@@ -103,6 +116,7 @@ def test_what_cannot_be_is_refused_in_one_line(
     with pytest.raises(FormatError, match="aims") as refusal:
         read_plant(path)
     assert text in str(refusal.value)
+    assert "aims: aims" not in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
 

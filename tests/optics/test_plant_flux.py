@@ -194,7 +194,7 @@ def no_receiver() -> Plant:
         ),
         (lambda: ht.flux(plant(), "2026-09-02T22:00Z"), r"the sun is \d+\.\d° below the hor"),
         (lambda: ht.flux(plant(), ["2026-09-02T10:00Z"]), "pass one time"),
-        (lambda: ht.flux(no_receiver(), sun=SUN), "has no receiver; add one to the plant file"),
+        (lambda: ht.flux(no_receiver(), sun=SUN), "has no receiver; write a plant file"),
         (
             lambda: ht.flux(plant(), sun=SUN, dni=-1.0),
             r"DNI must be 0 or more and finite, not -1.0 W/m²",

@@ -75,7 +75,7 @@ def test_what_people_do_with_the_records_is_recorded(data: Path, tmp_path: Path)
     with closing(Keeper(data, inline=True)) as keeper:
         assert [(e.source, e.text) for e in reversed(keeper.events())] == [
             ("security", f"{me}: made a backup: {tmp_path / 'b'}"),
-            ("security", f"{me}: exported calibrations: 1 heliostats to {tmp_path / 'csv'}"),
+            ("security", f"{me}: exported calibrations: 1 heliostat to {tmp_path / 'csv'}"),
             ("security", f"{me}: queried the telemetry: SELECT heliostat FROM telemetry"),
         ]
     with closing(Keeper(tmp_path / "new", inline=True)) as keeper:

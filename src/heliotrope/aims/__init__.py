@@ -14,7 +14,7 @@ Begin with `plan_aims`, which is `heliotrope.aim`.
 """
 
 from heliotrope.aims.errors import Risk, SharedErrors
-from heliotrope.aims.files import write_aims
+from heliotrope.aims.files import write_aim_map, write_aims
 from heliotrope.aims.plan import AimPlan, compare_aims, plan_aims
 from heliotrope.aims.ramp import ramp_up
 from heliotrope.aims.scene_aims import Demand, SceneAims, aim_scene
@@ -48,5 +48,6 @@ __all__ = [
     "read_limit",
     "read_panels",
     "read_table_limit",
+    "write_aim_map",
     "write_aims",
 ]

@@ -9,6 +9,7 @@ import numpy as np
 from heliotrope.aims.plan import AimPlan
 from heliotrope.files import write_text
 from heliotrope.geometry import FloatArray
+from heliotrope.optics.flux_files import write_map
 
 
 def write_aims(path: str | Path, plan: AimPlan, joins: FloatArray | None = None) -> None:
@@ -32,3 +33,17 @@ def write_aims(path: str | Path, plan: AimPlan, joins: FloatArray | None = None)
         more = () if joins is None else ("" if np.isnan(joins[k]) else f"{joins[k]:.0f}",)
         rows.writerow((name, *aim, state, f"{power[k]:.4f}", f"{gain[k]:.6f}", *more))
     write_text(path, text.getvalue())
+
+
+def write_aim_map(path: str | Path, plan: AimPlan) -> None:
+    """Write the cells of the receiver (CSV), as for `heliotrope.optics.flux_files.write_map`.
+
+    Further columns are the flux that no cell exceeds with the chosen probability, the limit minus
+    the margin, and whether the limit binds the cell.
+    """
+    more = {
+        "quantile_kw_m2": 1e-3 * plan.quantile,
+        "limit_kw_m2": 1e-3 * plan.limit,
+        "binds": plan.binding,
+    }
+    write_map(path, plan.light, more)

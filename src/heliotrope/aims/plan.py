@@ -16,7 +16,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.flux_limit import FluxLimit
 from heliotrope.field.plant import Plant
 from heliotrope.frames import ENU, Framed, Labelled, Variable
-from heliotrope.geometry import FloatArray
+from heliotrope.geometry import FloatArray, as_float
 from heliotrope.optics.plant_flux import FieldOptics, PlantFlux, one_sun, result_of
 from heliotrope.optics.plant_scene import no_receiver
 from heliotrope.sun import Times
@@ -109,6 +109,25 @@ class AimPlan(Value, Framed):
         return self.scene.limit
 
     @property
+    def binding(self) -> npt.NDArray[np.bool_]:
+        """Cells whose flux quantile is within 1 % of the limit or above it, (rows, columns)."""
+        return self.scene.binding
+
+    @property
+    def price(self) -> FloatArray:
+        """Power that a higher limit of each cell would add, W per W/m², (rows, columns).
+
+        It holds for small changes; zero if the strategy ignores the limit.
+        """
+        return as_float(self.scene.choice.prices.T)
+
+    @property
+    def cells(self) -> FloatArray:
+        """Centres of the cells, ENU m, (rows, columns, 3)."""
+        (surface,) = self.light.surfaces
+        return surface.cells.center.reshape(*self.limit.shape, 3)
+
+    @property
     def gain(self) -> FloatArray:
         """Power that a perfect calibration of each heliostat would add, W, (N,)."""
         return self.scene.gain
@@ -143,11 +162,13 @@ class AimPlan(Value, Framed):
             "flux": Variable(cells, self.light.flux, "W/m²"),
             "quantile": Variable(cells, self.quantile, "W/m²"),
             "limit": Variable(cells, self.limit, "W/m²"),
+            "binding": Variable(cells, self.binding),
+            "price": Variable(cells, self.price, "m²"),
         }
         labels: dict[str, npt.ArrayLike] = {
             "heliostat": self.names, "axis": ENU, "up": self.light.up, "right": self.light.right,
         }  # fmt: skip
-        maps = frozenset({"flux", "quantile", "limit"})
+        maps = frozenset({"flux", "quantile", "limit", "binding", "price"})
         notes = {"plant": self.light.plant, "strategy": self.strategy}
         return Labelled(row, labels, variables, maps, notes=notes)
 

@@ -414,11 +414,12 @@ def _refuse(scene: Scene, trial: SceneAims, demand: Demand, what: str, advice: s
     over = trial.quantile / trial.limit
     cell = tuple(int(n) for n in np.unravel_index(over.argmax(), over.shape))
     enough = trial.quantile[cell] / (1.0 - demand.limit.margin)
+    hint = f"; {demand.limit.unit_hint}" if demand.limit.unit_hint else ""
     raise InputError(
         f"receiver {surface_in(scene).name}: {what}; {_place(scene, cell)} gets "
         f"{1e-3 * trial.quantile[cell]:.4g} kW/m², of which {1e-3 * trial.risk.above[cell]:.4g} "
         f"are due to errors, {_percent(trial.excess)} above its {1e-3 * trial.limit[cell]:.4g}; "
-        f"raise the limit there to {1e-3 * enough:.4g} kW/m²{advice}"
+        f"raise the limit there to {1e-3 * enough:.4g} kW/m²{advice}{hint}"
     )
 
 

@@ -126,11 +126,24 @@ def parse_sun(text: str) -> tuple[float, float, float]:
     return east, north, up
 
 
-def open_plant(path: Path, site: "Site | None" = None) -> "Plant":
-    """Return the plant in a file or folder, whatever its format."""
-    from heliotrope.field import formats
+def open_plant(path: Path) -> "Plant":
+    """Return the plant in a file or folder with a site; for commands without ``--site``."""
+    return _opened(path, None, "use a file that contains its site, such as a plant file (TOML)")
 
-    return formats.open_plant(path, site=site)
+
+def open_field(path: Path, site: str | None) -> "Plant":
+    """Return the plant in a file or folder, with the text of ``--site`` if it contains no site."""
+    place = None if site is None else parse_site(site)
+    return _opened(path, place, "specify --site LATITUDE,LONGITUDE,HEIGHT")
+
+
+def _opened(path: Path, site: "Site | None", advice: str) -> "Plant":
+    from heliotrope.field.formats.opening import NoSiteError, open_plant
+
+    try:
+        return open_plant(path, site=site)
+    except NoSiteError as error:
+        raise NoSiteError(path, error.missing, advice) from None
 
 
 def parse_site(text: str) -> "Site":

@@ -251,6 +251,8 @@ def account(
 @app.command()
 def status(context: typer.Context, as_json: Json = False) -> None:
     """Print a summary of the plant's state."""
+    from heliotrope.values import amount
+
     with _client(context) as client:
         answer = client.get("summary")
         order = client.get("emergency") if answer["emergency"] else {}
@@ -259,10 +261,10 @@ def status(context: typer.Context, as_json: Json = False) -> None:
         return
     print(f"{answer['name']}, {answer['at']}")
     print_table(("state", "heliostats"), [(k, str(v)) for k, v in answer["states"].items()])
-    print(f"{answer['clusters_alive']} of {answer['clusters']} clusters reporting")
+    print(f"{answer['clusters_alive']} of {amount(answer['clusters'], 'cluster')} reporting")
     for name, value in answer["readings"].items():
         print(f"{name}: {'no reading' if value is None else f'{value:.3g}'}")
-    print(f"{answer['alarms']} alarms active or unacknowledged")
+    print(f"{amount(answer['alarms'], 'alarm')} active or unacknowledged")
     print(f"{answer['holder'] or 'nobody'} has the command authority")
     if answer["emergency"]:
         print(f"EMERGENCY ({order['act']}): {order['text']}")
@@ -286,6 +288,8 @@ def aims(context: typer.Context, as_json: Json = False) -> None:
 
 
 def _print_aims(answer: dict[str, Any]) -> None:
+    from heliotrope.values import amount
+
     if answer["problem"]:
         print(answer["problem"])
     if answer["idle"]:
@@ -297,7 +301,7 @@ def _print_aims(answer: dict[str, Any]) -> None:
         print(
             f"limit {1e-3 * answer['limit']:.4g} kW/m², flux including errors up to "
             f"{1e-3 * answer['peak']:.4g} kW/m², {rest}, "
-            f"{answer['binding']} cells at the limit, {answer['at']:.0f} s ago"
+            f"{amount(answer['binding'], 'cell')} at the limit, {answer['at']:.0f} s ago"
         )
         best = answer["planned"]
         print(
@@ -305,12 +309,12 @@ def _print_aims(answer: dict[str, Any]) -> None:
             + ("" if best is None else f" of {1e-3 * best:.5g} kW with the best aims")
         )
     print(
-        f"{answer['aimed']} heliostats have an aim, {answer['resting']} are at standby without "
-        f"one, {answer['waiting']} wait for the ramp, {answer['left']} still have to move"
+        f"heliostats: {answer['aimed']} with an aim, {answer['resting']} at standby without "
+        f"one, {answer['waiting']} waiting for the ramp, {answer['left']} still to move"
     )
     for names, text in (
-        (answer["by_hand"], "are aimed by an operator and stay"),
-        (answer["unlit"], "reach no cell of the receiver"),
+        (answer["by_hand"], "aimed by an operator and kept"),
+        (answer["unlit"], "reaching no cell of the receiver"),
         (answer["moved"], f"moved {answer['moved_ago'] or 0.0:.0f} s ago"),
     ):
         if names:
@@ -364,6 +368,8 @@ def flux(
     as_json: Json = False,
 ) -> None:
     """Print the predicted flux on a receiver, with its standard deviations."""
+    from heliotrope.values import amount
+
     with _client(context) as client:
         name = receiver or (client.get("field")["receivers"] or [""])[0]
         if not name:
@@ -372,7 +378,7 @@ def flux(
     if as_json:
         print_json(answer)
         return
-    print(f"{answer['receiver']}: {answer['heliostats']} heliostats")
+    print(f"{answer['receiver']}: {amount(answer['heliostats'], 'heliostat')}")
     print(f"power {_give_or_take(answer['power'], answer['power_sigma'], 'kW')}")
     print(f"peak {_give_or_take(answer['peak'], answer['peak_sigma'], 'kW/m²')}")
     if answer["intercept"] is not None:

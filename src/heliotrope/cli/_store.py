@@ -133,11 +133,12 @@ def export(
     """Write every calibration step as CSV, one folder per heliostat."""
     from heliotrope.store import export as exports
     from heliotrope.store.database import Database
+    from heliotrope.values import amount
 
     with Database(place) as database:
         written = exports.export(database, to, heliostat)
-    note_use(place, "EXPORTED", f"{len(written)} heliostats to {to}")
-    print(f"{to}: {len(written)} heliostats")
+    note_use(place, "EXPORTED", f"{amount(len(written), 'heliostat')} to {to}")
+    print(f"{to}: {amount(len(written), 'heliostat')}")
 
 
 @app.command()

@@ -1,5 +1,6 @@
 """``heliotrope aim``: aims that keep the receiver's flux below a limit despite mirror errors."""
 
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +10,8 @@ import typer
 
 from heliotrope.cli._calibration import progress
 from heliotrope.cli._common import (
-    open_plant,
+    open_field,
     parse_numbers,
-    parse_site,
     parse_sun,
     parse_time,
     print_json,
@@ -41,12 +41,15 @@ from heliotrope.cli._light import (
 from heliotrope.errors import InputError, shown
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
     from heliotrope.aims import AimPlan, FluxLimit
     from heliotrope.aims.strategies import Strategy
     from heliotrope.geometry import FloatArray
 
-#: Maximum number of heliostats and cells that are listed.
-NAMED = 5
+#: Maximum number of heliostats and cells that are listed, and of ranges of rows or columns.
+NAMED, RANGES = 5, 3
 
 
 def aim(
@@ -139,6 +142,10 @@ def aim(
     cells: CellOption = None,
     tower: Towers = None,
     csv: Annotated[Path | None, typer.Option("--csv", help="File for the aims.")] = None,
+    cells_csv: Annotated[
+        Path | None,
+        typer.Option("--map", help="File for each cell's flux and limit (CSV)."),
+    ] = None,
     picture: Annotated[
         Path | None, typer.Option(help="Picture to write (.png, .svg or .pdf).")
     ] = None,
@@ -150,11 +157,12 @@ def aim(
     light = light_of(
         dni, shape, air, slope_mrad, error_mrad, reflectivity, clean, focus, facets, cells, tower
     )
-    _check(field, csv, picture)
+    files = {"csv": csv, "map": cells_csv, "picture": picture}
+    _check(field, files)
     allowed = _limit(limit, margin, panels)
     if time is not None and sun is not None:
         raise InputError("use --time or --sun, not both")
-    plant = open_plant(field, None if site is None else parse_site(site))
+    plant = open_field(field, site)
     light = replace(light, canting=canting_of(canting, light.facets, plant))
     when = None if sun is not None else noon(plant) if time is None else parse_time(time)
     options: dict[str, Any] = {
@@ -171,16 +179,10 @@ def aim(
             for name in names
         }
     chosen = plans[names[-1]]
+    if allowed.unit_hint:
+        print(f"heliotrope: {limit}: {allowed.unit_hint}", file=sys.stderr)
     joins = None if ramp is None else chosen.ramp_up(1e3 / 60.0 * ramp)
-    if csv is not None:
-        from heliotrope.aims import write_aims
-
-        write_aims(csv, chosen, joins)
-    if picture is not None:
-        from heliotrope.calibration.plan.report import write_picture
-        from heliotrope.plot import aim_figure
-
-        write_picture(picture, aim_figure(*plans.values()))
+    _write(files, plans, chosen, joins)
     if as_json:
         print_json(_document(plans, chosen) | ({} if joins is None else {"joins_s": joins}))
         return
@@ -190,18 +192,39 @@ def aim(
         print(f"the flux differs from the desired flux by {100 * far:.1f} % of its mean (RMS)")
     if joins is not None:
         _print_ramp(chosen, joins)
-    for name, path in (("csv", csv), ("picture", picture)):
+    for name, path in files.items():
         if path is not None:
             print(f"{name}: {path}")
 
 
-def _check(field: Path, csv: Path | None, picture: Path | None) -> None:
+def _check(field: Path, files: Mapping[str, Path | None]) -> None:
     from heliotrope.calibration.plan.report import check_picture
     from heliotrope.cli.plan import check_outputs
 
+    picture = files["picture"]
     if picture is not None:
         check_picture(picture)
-    check_outputs(tuple(path for path in (csv, picture) if path is not None), field, None)
+    check_outputs(tuple(path for path in files.values() if path is not None), field, None)
+
+
+def _write(
+    files: Mapping[str, Path | None],
+    plans: "Mapping[Any, AimPlan]",
+    chosen: "AimPlan",
+    joins: "FloatArray | None",
+) -> None:
+    from heliotrope.aims import write_aim_map, write_aims
+    from heliotrope.calibration.plan.report import write_picture
+
+    csv, cells, picture = files["csv"], files["map"], files["picture"]
+    if csv is not None:
+        write_aims(csv, chosen, joins)
+    if cells is not None:
+        write_aim_map(cells, chosen)
+    if picture is not None:
+        from heliotrope.plot import aim_figure
+
+        write_picture(picture, aim_figure(*plans.values()))
 
 
 def _limit(text: str, margin: float, panels: Path | None) -> "FluxLimit":
@@ -249,7 +272,8 @@ def _document(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> dict[str, An
         "flux_w_m2": chosen.light.flux,
         "quantile_w_m2": chosen.quantile,
         "limit_w_m2": chosen.limit,
-        "binding": chosen.scene.binding,
+        "binding": chosen.binding,
+        "price_m2": chosen.price,
         "heliostats": [
             {
                 "name": name,
@@ -290,20 +314,66 @@ def _print(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> None:
     print_table(
         header, rows, title=f"{chosen.light.plant}: aims on {chosen.light.maps[0].receiver}"
     )
-    if chosen.lost_mirrors.any():
-        print(f"{int(chosen.lost_mirrors.sum()):,} heliostats are lost")
-    if chosen.elsewhere.any():
-        print(f"{int(chosen.elsewhere.sum()):,} heliostats belong to other receivers")
-    if chosen.unlit.any():
-        first = chosen.names[int(chosen.unlit.argmax())]
-        print(
-            f"{int(chosen.unlit.sum()):,} heliostats reach no receiver cell; the first is {first}"
-        )
-    binding = int(chosen.scene.binding.sum())
-    print(f"{binding:,} of {chosen.limit.size:,} cells at the limit")
+    for mask, one, many in (
+        (chosen.lost_mirrors, "is lost", "are lost"),
+        (chosen.elsewhere, "belongs to another receiver", "belong to other receivers"),
+        (chosen.unlit, "reaches no receiver cell", "reach no receiver cell"),
+    ):
+        count = int(mask.sum())
+        first = chosen.names[int(mask.argmax())]
+        if count == 1:
+            print(f"1 heliostat {one}: {first}")
+        elif count:
+            print(f"{count:,} heliostats {many}; the first is {first}")
+    _print_binding(chosen)
     best = np.argsort(-chosen.gain)[:NAMED]
     words = [
         f"{chosen.names[k]} {1e-3 * chosen.gain[k]:.3g} kW" for k in best if chosen.gain[k] > 0
     ]
     if words:
         print(f"calibration would gain the most power at {', '.join(words)}")
+
+
+def _print_binding(chosen: "AimPlan") -> None:
+    """Print where the limit binds, and the cells in which a higher limit would gain most."""
+    import numpy as np
+
+    binding, over = chosen.binding, chosen.quantile / chosen.limit - 1.0
+    count = int(binding.sum())
+    line = f"{count:,} of {binding.size:,} cells {'at' if chosen.excess <= 0 else 'at or above'} "
+    line += "the limit"
+    if not count:
+        closest = _cell(chosen, over.argmax())
+        print(f"{line}; the closest is {-100 * chosen.excess:.1f} % below it: {closest}")
+        return
+    rows, columns = (np.unique(indices) for indices in np.nonzero(binding))
+    print(f"{line}, in {_ranges('row', rows)} (0 is the lowest) and {_ranges('column', columns)}")
+    gain = np.where(binding, 1e-5 * chosen.limit * chosen.price, 0.0)
+    priced = np.count_nonzero(gain)
+    order = np.argsort(-(gain if priced else over), axis=None)
+    for k in order[: min(NAMED, priced or count)]:
+        text = f"a 1 % higher limit there adds about {gain.flat[k]:.2g} kW"
+        if not priced:
+            side = "above" if over.flat[k] > 0.0 else "below"
+            text = f"{100 * abs(over.flat[k]):.1f} % {side} the limit"
+        print(f"  {_cell(chosen, k)}: {text}")
+
+
+def _cell(chosen: "AimPlan", k: "np.intp") -> str:
+    """Return the row, column and place of a cell as text."""
+    import numpy as np
+
+    row, column = np.unravel_index(k, chosen.limit.shape)
+    # Adding 0 removes the sign from numbers that round to −0.
+    east, north, up = chosen.cells[row, column].round(2) + 0.0
+    return f"row {row}, column {column} ({east:.2f}, {north:.2f}, {up:.2f} m)"
+
+
+def _ranges(noun: str, numbers: "npt.NDArray[np.intp]") -> str:
+    """Return the ranges of rising numbers as text, or the whole range if there are many."""
+    import numpy as np
+
+    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
+    parts = parts if len(parts) <= RANGES else [numbers]
+    text = ", ".join(f"{p[0]}" if p[0] == p[-1] else f"{p[0]} to {p[-1]}" for p in parts)
+    return f"{noun}{'' if text.isdigit() else 's'} {text}"

@@ -26,6 +26,7 @@ def cluster(
 ) -> None:
     """Run a cluster of heliostats until SIGTERM or Ctrl-C; the cluster then defocuses them."""
     from heliotrope.errors import InputError
+    from heliotrope.values import amount
 
     try:
         from heliotrope.cluster.config_file import read_cluster
@@ -37,8 +38,8 @@ def cluster(
         ) from None
     installation = read_cluster(config)
     if check:
-        count = len(installation.config.heliostats)
-        print(f"{config}: cluster {installation.config.name} of {count} heliostats")
+        count = amount(len(installation.config.heliostats), "heliostat")
+        print(f"{config}: cluster {installation.config.name} of {count}")
         clock = SystemClock()
         papers = Papers(clock)
         _link(installation, clock, papers)

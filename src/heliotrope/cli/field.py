@@ -32,6 +32,7 @@ def check(
     """Print all errors and warnings in a plant file; exit code 2 if the plant cannot run."""
     from heliotrope.field.formats import plant_file
     from heliotrope.plant.field.aims import BeamCheck
+    from heliotrope.values import amount
 
     findings = plant_file.check_plant(file)
     invalid = any(finding.severity == "error" for finding in findings)
@@ -41,7 +42,8 @@ def check(
         if unsafe:
             name, text = next(iter(unsafe.items()))
             text = (
-                f"{len(unsafe)} heliostats cannot be stowed at the pose in the file: {name}: {text}"
+                f"{amount(len(unsafe), 'heliostat')} cannot be stowed at the pose in the file: "
+                f"{name}: {text}"
             )
             findings.append(plant_file.Finding("warning", text))
     if as_json:
@@ -52,7 +54,8 @@ def check(
         if not invalid:
             plant = plant_file.read_plant(file)
             print(
-                f"{file}: {len(plant)} heliostats, {len(plant.targets)} targets: "
+                f"{file}: {amount(len(plant), 'heliostat')}, "
+                f"{amount(len(plant.targets), 'target')}: "
                 f"{'it can run; see the warnings above' if findings else 'no problems found'}"
             )
     if invalid:

@@ -9,9 +9,8 @@ import typer
 
 from heliotrope.cli._calibration import progress
 from heliotrope.cli._common import (
-    open_plant,
+    open_field,
     parse_point,
-    parse_site,
     parse_sun,
     parse_time,
     print_json,
@@ -136,7 +135,7 @@ def flux(
         as_json,
     )
     order.check(field, table=every is not None or year, year=year)
-    plant = open_plant(field, None if site is None else parse_site(site))
+    plant = open_field(field, site)
     order = replace(order, light=replace(light, canting=canting_of(canting, light.facets, plant)))
     if year:
         _year(plant, order, any_of={"--time": time, "--sun": sun, "--every": every}, rays=rays)

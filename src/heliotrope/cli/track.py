@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from heliotrope.cli._common import (
-    open_plant,
+    open_field,
     parse_point,
-    parse_site,
     parse_sun,
     parse_time,
     print_json,
@@ -166,7 +165,7 @@ def track(
 
 def _opened(field: Path, place: str, calibration: Path | None) -> "Plant":
     """Return a field at a site ("" for its own site), with a calibration."""
-    plant = open_plant(field, parse_site(place) if place else None)
+    plant = open_field(field, place or None)
     if calibration is None:
         return plant
     from heliotrope.calibration.report.results import read_json

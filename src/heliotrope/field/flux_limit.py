@@ -13,6 +13,8 @@ from heliotrope.geometry import FloatArray, as_float
 
 #: Largest flux that a limit may state, W/m²; the sun's own surface emits 6.3e7.
 MOST = 6.4e7
+#: A map that is lower than this in every cell is probably in kW/m²; ten suns, W/m².
+UNUSUAL = 1e4
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +51,17 @@ class FluxLimit:
             raise InputError(
                 f"flux limit: the margin must be between 0 and 0.5, not {self.margin:g}"
             )
+
+    @property
+    def unit_hint(self) -> str:
+        """What to do about a map whose values are probably in kW/m²; "" for other limits."""
+        most = float(as_float(self.flux).max())
+        if np.ndim(self.flux) == 0 or most >= UNUSUAL:
+            return ""
+        return (
+            f"no cell's limit is above {most:,.0f} W/m², which is very low; if the numbers were "
+            "meant as kW/m², multiply them by 1,000"
+        )
 
     @classmethod
     def of(cls, limit: "FluxLimit | npt.ArrayLike") -> "FluxLimit":

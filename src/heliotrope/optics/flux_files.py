@@ -8,10 +8,12 @@
 """
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.files import write_text
@@ -60,22 +62,41 @@ def write_heliostats(path: str | Path, found: PlantFlux, year: FluxTable | None 
     write_text(path, _csv([names, *rows]))
 
 
-def write_map(path: str | Path, found: PlantFlux) -> None:
-    """Write the cells of the receivers (CSV): centres (ENU), area, flux and its standard error."""
-    header = ["receiver", "east_m", "north_m", "up_m", "area_m2", "flux_kw_m2"]
+def write_map(
+    path: str | Path, found: PlantFlux, more: Mapping[str, npt.NDArray[Any]] | None = None
+) -> None:
+    """Write the cells of the receivers (CSV): centres (ENU), area, flux and its standard error.
+
+    Parameters
+    ----------
+    path
+        File.
+    found
+        Flux. Rows of cells are counted from the lowest, columns from the left or from the north.
+    more
+        Further columns by name, (rows, columns) each, if there is one receiver: truth values, or
+        numbers in the unit of their name.
+    """
+    header = ["receiver", "row", "column", "east_m", "north_m", "up_m", "area_m2", "flux_kw_m2"]
     if found.errors:
         header.append("error_kw_m2")
-    rows: list[Any] = [header]
+    extra = [
+        ["yes" if v else "no" for v in values.flat] if values.dtype == np.bool_
+        else _texts(values.ravel(), 4)
+        for values in (more or {}).values()
+    ]  # fmt: skip
+    rows: list[Any] = [[*header, *(more or {})]]
     for k, (surface, view) in enumerate(zip(found.surfaces, found.maps, strict=True)):
         cells = surface.cells
-        columns = [
+        columns: list[Any] = [
+            *(place.flat for place in np.indices(view.flux.shape)),
             *(_texts(c, 4) for c in cells.center.T),
             _texts(cells.area, 6),
             _texts(1e-3 * view.flux.ravel(), 4),
         ]
         if found.errors:
             columns.append(_texts(1e-3 * found.errors[k].ravel(), 4))
-        rows += [(surface.name, *row) for row in zip(*columns, strict=True)]
+        rows += [(surface.name, *row) for row in zip(*columns, *extra, strict=True)]
     write_text(path, _csv(rows))
 
 

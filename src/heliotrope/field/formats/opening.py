@@ -13,6 +13,29 @@ DEFAULT_MIRROR = 12.2
 _TABLES = (".csv", ".txt", ".tsv")
 
 
+class NoSiteError(FormatError):
+    """A file without a site, for which the caller specified none either.
+
+    Parameters
+    ----------
+    path
+        The file.
+    problem
+        What is missing.
+    advice
+        How the caller specifies the site.
+    """
+
+    def __init__(
+        self,
+        path: object,
+        problem: str,
+        advice: str = "specify the site (site=Site(latitude, longitude, height))",
+    ) -> None:
+        super().__init__(path, f"{problem}, so the sun cannot be computed; {advice}")
+        self.missing = problem
+
+
 def open_plant(
     path: str | Path,
     *,
@@ -42,8 +65,8 @@ def open_plant(
     Raises
     ------
     FormatError
-        If the file does not exist, cannot be used, or needs a site; the message names file, place,
-        value and limit.
+        If the file does not exist or cannot be used; the message names file, place, value and
+        limit. `NoSiteError` if the file needs a site.
     InputError
         If ``site`` is not a `Site`.
     """
@@ -97,7 +120,7 @@ def _read(
 def _of_heliok(place: Path, site: Site | None) -> Plant:
     document = heliok.read(place)
     if site is None and not heliok.has_location(document):
-        raise FormatError(place, f"no <Location> in <World>, {_GIVE}")
+        raise NoSiteError(place, "no <Location> in <World>")
     return heliok.to_plant(document, site or heliok.site(document, 0.0))
 
 
@@ -116,12 +139,6 @@ def _of_solarpilot(
     return plant.with_notes({"size of the mirrors": size})
 
 
-_GIVE = (
-    "so the sun cannot be computed; specify the site (site=Site(latitude, longitude, height), "
-    "--site LATITUDE,LONGITUDE,HEIGHT)"
-)
-
-
 def _refuse_unused(place: Path, **arguments: object) -> None:
     """Refuse an argument that does not apply to the format of a file."""
     for name, value in arguments.items():
@@ -134,5 +151,5 @@ def _refuse_unused(place: Path, **arguments: object) -> None:
 
 def _needed(place: Path, site: Site | None) -> Site:
     if site is None:
-        raise FormatError(place, f"a table of positions contains no site, {_GIVE}")
+        raise NoSiteError(place, "a table of positions contains no site")
     return site

@@ -389,6 +389,8 @@ def _warnings(plant: Plant) -> list[str]:
         texts.append("there is no target: calibration with a camera is not possible")
     if not plant.receivers:
         texts.append("there is no receiver")
+    if plant.aims.limit is not None and plant.aims.limit.unit_hint:
+        texts.append(f"aims: {plant.aims.map}: {plant.aims.limit.unit_hint}")
     if len(plant) == 0:
         return [*texts, "there are no heliostats"]
     texts += _crowding(plant)

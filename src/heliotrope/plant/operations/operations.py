@@ -62,6 +62,7 @@ from heliotrope.plant.visits.photographs import Shot
 from heliotrope.plant.workers import Worker, at_once
 from heliotrope.safety import Act
 from heliotrope.store.records import NOTE, JournalEntry, JournalQuery, Kind, Records
+from heliotrope.values import amount
 
 T = TypeVar("T")
 
@@ -803,7 +804,8 @@ class Operations:
         names = tuple(dict.fromkeys(heliostats)) or self.names
         self.automatic.want(names, wanted=True)
         self._aiming.by_person(names, aimed=False)
-        self._tell(person, f"put {len(names)} heliostats under automatic control", "command", names)
+        text = f"put {amount(len(names), 'heliostat')} under automatic control"
+        self._tell(person, text, "command", names)
         progress = partial(self.automatic.following, self.plant.now())
         return self.errands.begin("AUTOMATIC", names, progress, self.automatic.follows_within)
 

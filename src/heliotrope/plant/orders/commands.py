@@ -28,6 +28,7 @@ from heliotrope.plant.orders.taken import Taken
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.orders.unacknowledged import Unacknowledged
 from heliotrope.plant.refusals import BEAM_REFUSED, NOT_NOW, OUT_OF_SERVICE
+from heliotrope.values import amount
 
 #: Disk work, and the disk work that reverts it.
 Storing = tuple[Work, Callable[..., object]]
@@ -326,7 +327,7 @@ class Commands:
 
         groups = grouped(names, targets)
         values = next(iter(groups)) if len(groups) == 1 else ()
-        all_names, text = (*names, *out), f"{len(groups)} points"
+        all_names, text = (*names, *out), amount(len(groups), "point")
 
         def accept(store: tuple[Work, Work] | None) -> Ticket:
             order = person, token, name, values, all_names, text, store, out
