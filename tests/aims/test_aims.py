@@ -454,6 +454,15 @@ def test_a_plant_is_aimed_and_what_it_cannot_do_is_refused(tmp_path: Any) -> Non
         aim_scene(replace(field(5), surfaces=two), Demand(FluxLimit(1e6)))
 
 
+def test_where_errors_take_most_of_the_limit_the_rest_is_used(scene: Scene, peak: float) -> None:
+    own = np.tile(9e-6 * np.eye(2), (300, 1, 1))
+    given = replace(scene, mirrors=replace(scene.mirrors, pointing=own))
+    got = aim_scene(given, Demand(FluxLimit(0.1 * peak)))
+    assert -0.05 < got.excess <= 1e-3
+    assert got.risk.above.max() > 0.25 * got.limit.max()
+    assert (~got.defocused).sum() > 10
+
+
 def test_cells_with_more_room_ask_for_less_than_cells_that_are_all_at_their_limit(
     scene: Scene,
 ) -> None:

@@ -27,8 +27,8 @@ from heliotrope.optics.shading import IntArray
 
 #: Maximum number of choices; the limit is approached from this share below it.
 ROUNDS, BELOW = 16, 5e-4
-#: Rounds after which no cell regains room, and no mirror moves unnecessarily.
-FREE = 3
+#: Rounds in which cells may regain room; afterwards no mirror moves unnecessarily.
+FREE = 5
 #: From then on the remaining excess times this factor is subtracted from the limit.
 BEYOND = 1.5
 #: Minimum share of the limit left to the next choice after errors; excess that counts as zero.
@@ -264,6 +264,7 @@ def _held(
         light_now = field.flux(start.choice.choice).sum() / max(start.choice.flux.sum(), 1e-300)
         more = light_now * (start.quantile - start.choice.flux.T)
     best: SceneAims | None = None
+    step, before = 1.0, 0.0
     for k in range(ROUNDS):
         cap = np.maximum(aimed_at - more, LEAST * limit)
         first = choice is None
@@ -276,11 +277,16 @@ def _held(
         if best is None or _rank(trial) > _rank(best):
             best = trial
         # Early rounds may leave room, taken for errors of a choice that stood higher.
-        if best.excess <= 0.0 and (k + 1 >= FREE or best.excess > -BINDS):
+        if -BINDS < best.excess <= 0.0 or (k + 1 >= FREE and trial.excess <= 0.0):
             break
         new = trial.quantile - choice.flux.T
-        # From then on no cell regains room, so that the rounds come to an end.
-        more = new if k < FREE else more + BEYOND * np.maximum(new - more, 0.0)
+        if k < FREE:
+            # A choice that is too low after one that was too high, or the reverse, is overshoot.
+            step *= 0.5 if before * trial.excess < 0.0 else 1.0
+            more, before = more + step * (new - more), trial.excess
+        else:
+            # No cell regains room, so that the rounds come to an end.
+            more = more + BEYOND * np.maximum(new - more, 0.0)
     assert best is not None
     if best.excess > HOLDS:
         advice = "let heliostats be defocused" if demand.keep else "ask for a lower probability"
