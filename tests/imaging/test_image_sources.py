@@ -639,7 +639,7 @@ def test_frames_that_have_no_average() -> None:
     with pytest.raises(InputError, match="no frame to average"):
         average([])
     for other in (_pixels(1), still.pixels.astype(np.uint16), np.dstack([still.pixels] * 3)):
-        with pytest.raises(InputError, match="differ; use frames of the same kind"):
+        with pytest.raises(InputError, match="use frames of the same size and depth"):
             average([still, Frame(other, "other")])
 
 

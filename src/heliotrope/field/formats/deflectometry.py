@@ -1,9 +1,9 @@
 """Reads mirror surfaces that PAINT publishes (HDF5), and converts them to slopes.
 
-A file contains the groups ``facet1``, ``facet2``, … of one heliostat, in the order of its
-properties, each with the datasets ``surface_points``, m, and ``surface_normals``, (K, 3), in the
-axes in which the properties define the facets. Differences in canting from the properties become
-part of the slopes.
+A file contains the groups ``facet1``, ``facet2``, … of one heliostat, in the order in which the
+heliostat's properties file lists its facets. Each group has the datasets ``surface_points``, m, and
+``surface_normals``, (K, 3), in the axes in which the properties file defines the facets. Where the
+canting differs from that of the properties file, the difference becomes part of the slopes.
 """
 
 from pathlib import Path

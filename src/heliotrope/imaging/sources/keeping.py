@@ -51,8 +51,9 @@ def average(frames: Iterable[Frame], max_shift: float = 1.0) -> Frame:
         first = first or frame
         if (frame.pixels.shape, frame.pixels.dtype) != (first.pixels.shape, first.pixels.dtype):
             raise InputError(
-                f"{frame.name}: {frame.pixels.shape} of {frame.pixels.dtype} and {first.name}: "
-                f"{first.pixels.shape} of {first.pixels.dtype} differ; use frames of the same kind"
+                f"{frame.name} has {frame.pixels.shape} pixels of {frame.pixels.dtype}, but "
+                f"{first.name} has {first.pixels.shape} of {first.pixels.dtype}; use frames of the "
+                "same size and depth"
             )
         shift = find_shift(first, frame) if used and min(frame.size) >= 16 else None
         if shift is not None and math.hypot(*shift) > max_shift:

@@ -213,7 +213,7 @@ class Desk:
     # -- commands --------------------------------------------------------------------------
 
     def order_emergency(self, who: Person, given: orders.EmergencyCall) -> EmergencyView:
-        """Order an emergency, once per identifier, because the page sends each order twice."""
+        """Declare an emergency, once per identifier, because the page sends each order twice."""
         key, now = (who.name, given.call), time.monotonic()
         if not given.call or now - self._called.get(key, -math.inf) >= SAME:
             self.operations.emergency(who, given.act, given.reason)

@@ -147,7 +147,7 @@ class ReceiverCycle(CodedCycle):
         if not change <= self.settings.steady:
             raise RefusedError(
                 f"{self.kind}: the light on {face.name} changed by {100.0 * change:.0f} % in "
-                f"{_LOOKS * _BETWEEN:g} s, the limit is {100.0 * self.settings.steady:g} %; it "
-                "begins when the sun is steady"
+                f"{_LOOKS * _BETWEEN:g} s (limit {100.0 * self.settings.steady:g} %); the visit "
+                "starts once the light is steady"
             )
         return float(np.median(seen))
