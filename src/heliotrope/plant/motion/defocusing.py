@@ -155,7 +155,7 @@ def defocused_field(
 
 
 def _cost(check: BeamCheck, row: int, path: FloatArray, sun: FloatArray) -> tuple[bool, float]:
-    """Return whether a path (K, 2) ends inside a volume, and how far it turns inside volumes, rad."""
+    """Return whether a path (K, 2) ends inside a volume, and how far it turns inside, rad."""
     turns = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(path, axis=0)).max(axis=-1))])
     at = np.linspace(0.0, turns[-1], 2 + int(turns[-1] / _PIECE))
     poses = np.stack([np.interp(at, turns, path[:, i]) for i in (0, 1)], axis=-1)
