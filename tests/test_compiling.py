@@ -22,7 +22,7 @@ from heliotrope.calibration.learn.learning import learn
 from heliotrope.calibration.median import median
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import normalize
-from heliotrope.jit import COMPILATION, Compilation, as_input, is_compiled
+from heliotrope.jit import COMPILATION, PROGRAM, Compilation, as_input, is_compiled
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.kernels import track as track_kernels
 from heliotrope.mechanism.kernels import warm as kernels_of_warm
@@ -60,12 +60,24 @@ def test_a_terminal_is_told_once(
 ) -> None:
     told = Terminal(terminal=terminal)
     monkeypatch.setattr("sys.stderr", told)
+    monkeypatch.delenv(PROGRAM, raising=False)
     assert njit(lambda x: x + 1)(1) == 2
     assert njit(lambda x: x + 2)(1) == 3
     assert listening.told
     lines = told.getvalue().splitlines()
     assert len(lines) == terminal
     assert all("compiling kernels, once after an installation" in line for line in lines)
+
+
+def test_a_child_process_leaves_the_report_to_its_parent(
+    listening: Compilation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = Terminal(terminal=True)
+    monkeypatch.setattr("sys.stderr", told)
+    monkeypatch.setenv(PROGRAM, str(os.getppid()))
+    assert njit(lambda x: x + 1)(1) == 2
+    assert listening.told
+    assert told.getvalue() == ""
 
 
 @pytest.mark.parametrize("collecting", [True, False])

@@ -14,6 +14,7 @@ them repeatedly for garbage took a fifth of its time.
 """
 
 import gc
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,10 @@ INNER: dict[str, Any] = {**OPTIONS, "cache": False, "no_cpython_wrapper": True}
 #: itself.
 INLINED: dict[str, Any] = {**INNER, "forceinline": True}
 
+
+#: Environment variable with the process that reports compilation also for its child processes,
+#: which inherit the variable.
+PROGRAM = "HELIOTROPE_PROGRAM"
 
 #: Function that turns a literal number in a call into an ordinary number. The compiler treats the 0
 #: of ``f(0)`` as a separate type and compiles one version of f for each literal. The loops of the
@@ -74,7 +79,9 @@ class Compilation(event.Listener):
         if self.told:
             return
         self.told = True
-        if sys.stderr is not None and sys.stderr.isatty():
+        mine = str(os.getpid())
+        inherited = os.environ.setdefault(PROGRAM, mine) != mine
+        if not inherited and sys.stderr is not None and sys.stderr.isatty():
             print(  # noqa: T201
                 "heliotrope: compiling kernels, once after an installation; "
                 "this takes up to half a minute",

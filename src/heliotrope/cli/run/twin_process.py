@@ -1,6 +1,7 @@
 """The simulated field that `heliotrope run` starts if no links are specified."""
 
 import contextlib
+import os
 import shutil
 import socket
 import subprocess
@@ -95,6 +96,8 @@ def twin_process(options: Sequence[str], seed: int, measured: int) -> Iterator["
         port = server.getsockname()[1]
     command = [sys.executable, "-c", _MAIN, "twin", *options, "--folder", str(folder)]
     command += ["--seed", str(seed), "--plant", f"127.0.0.1:{port}", "--child"]
+    # The plant reports compilation for the field too (`jit.PROGRAM`, whose import takes a second).
+    os.environ.setdefault("HELIOTROPE_PROGRAM", str(os.getpid()))
     # In a session of its own, because Ctrl-C in the terminal is meant for the plant.
     process = subprocess.Popen(  # noqa: S603
         command,

@@ -582,7 +582,7 @@ def calibrate(desk: Desk, who: Person, order: orders.OneCalibration) -> TicketSt
     `together` names other heliostats that go to the target in the same [joint
     visit](../explanation/plant.md#many-mirrors-on-one-target), as soon as all are ready. With
     `receiver`, all heliostats stay in production and are [measured on the
-    receiver](../explanation/plant.md#mirrors-in-production), as soon as all track the receiver.
+    receiver](../explanation/plant.md#many-mirrors-on-a-receiver), as soon as all track it.
     """
     return desk.tickets.put(desk.operations.calibrate(who, **order.model_dump()))
 
