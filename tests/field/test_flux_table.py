@@ -59,7 +59,7 @@ def test_files_are_read_and_what_does_not_fit_is_one_line(tmp_path: Path) -> Non
         ({"lines": LINES.replace("570,3,6e5\n", "")}, "no flux for 570 °C at 3 m/s"),
         ({"lines": LINES + "570,3,7e5\n"}, "line 6.*twice"),
         ({"lines": LINES.replace("8e5", "much")}, "line 2, column flux_w_m2"),
-        ({"lines": LINES.replace("8e5", "-1")}, "must be above 0"),
+        ({"lines": LINES.replace("8e5", "-1")}, "is outside 1 to"),
         ({"lines": LINES.replace("flux_w_m2", "flux")}, "no column flux_w_m2"),
         ({"lines": LINES.splitlines()[0] + "\n"}, "no rows"),
         ({"panels": PANELS.replace("0.25,0.5", "0.3,0.5")}, "0.25 to 0.3 is without a limit"),
