@@ -218,7 +218,7 @@ def test_campaign_refusals() -> None:
     with pytest.raises(InputError, match="one axis"):
         Fleet(FIELD[0], NAMES, fleet.information, fleet.form, AIM)
     blind = Fleet(FIELD[:2], NAMES, fleet.information, 0.0 * fleet.form, AIM)
-    with pytest.raises(InputError, match="no heliostat can serve its aim"):
+    with pytest.raises(InputError, match="no heliostat can reach its aim"):
         plan_campaign([blind], *run, START, START + DAY)
 
 

@@ -50,7 +50,7 @@ def test_opencsp_gets_the_position_and_the_rest_is_named(tmp_path: Path) -> None
     other = tmp_path / "other.csv"
     lines = source.read_text().splitlines(keepends=True)
     other.write_text("".join([lines[0], *lines[2:]]))
-    with pytest.raises(InputError, match=f"heliostat {name}: .*no heliostat of that name"):
+    with pytest.raises(InputError, match=f"heliostat {name}: .*no heliostat with that name"):
         ht.write_opencsp(tmp_path / "none.csv", other, plant, learned)
     assert not (tmp_path / "none.csv").exists()
     with pytest.raises(InputError, match=f"heliostat {name}: .*two_jacks; use write_plant"):

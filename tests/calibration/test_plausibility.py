@@ -116,8 +116,8 @@ def _below(seen: Sightings) -> FloatArray:
         (lambda s: {"counts": [s.counts[4, 0], 3e7]}, "of elevation are beyond its end stops: "),
         (lambda s: {"counts": [-9e6, s.counts[4, 1]]}, "of azimuth are beyond its end stops: "),
         (lambda s: {"counts": s.counts[4] + [3.8e6, 0]}, "the beam comes from the back"),
-        (lambda s: {"destination": s.destination[4] + [0, 0, -9.0]}, "on no target: 8."),
-        (lambda s: {"destination": s.destination[4] + [0, -2.0, 0]}, "on no target: 2."),
+        (lambda s: {"destination": s.destination[4] + [0, 0, -9.0]}, "on no target: it is 8."),
+        (lambda s: {"destination": s.destination[4] + [0, -2.0, 0]}, "on no target: it is 2."),
         (
             lambda s: {"destination": NOMINAL[3].pose(s.counts[4]).vertex - 20.0 * s.source[4]},
             "on no target",
@@ -488,7 +488,7 @@ def test_a_folder_with_a_bad_year_and_a_copy_is_read(tmp_path: Path) -> None:
     field = workflow.read_field_sightings(paint.read_plant(tmp_path), tmp_path)
     assert len(field.sightings) == 10
     assert [line.split(": ", 1)[1].split(":")[0] for line in field.left_out] == [
-        "the year is out of range",
-        "the year is outside 1970 to 2099",
+        "the year is out of range; correct the time",
+        "the year is outside 1970 to 2099; correct the time",
         "a copy of another sighting",
     ]

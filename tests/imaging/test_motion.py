@@ -260,7 +260,7 @@ def test_why_frames_cannot_be_compared() -> None:
     cases: list[tuple[Image, Image, str]] = [
         (black, good, "the first frame is dark"),
         (good, white, "the second frame is overexposed: 100 % of it is saturated"),
-        (good, _shoot(SCENES[0], rng, gain=0.2), "the brightness changed by 0.2"),
+        (good, _shoot(SCENES[0], rng, gain=0.2), "the brightness changed by a factor of 0.2"),
         (good, _shoot(SCENES[0], rng, (40.0, 20.0)), "the camera moved by 44."),
         (good, upset, "more than half of the frame changed"),
     ]

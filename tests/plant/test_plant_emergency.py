@@ -705,7 +705,7 @@ def test_a_given_reading_counts_from_when_it_was_made_and_goes_stale_as_any_othe
             give(3.0, -2.0)
         with pytest.raises(InputError, match="finite"):
             give(math.nan)
-        with pytest.raises(UnknownNameError, match="there is no reading that programs give"):
+        with pytest.raises(UnknownNameError, match='there is no "api" reading'):
             given.take(ENGINEER, "receiver_flux", 0.0, 0.0)
         # The last one was made 1.5 s ago.
         await bench.wait(3.0)

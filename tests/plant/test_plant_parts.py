@@ -486,6 +486,9 @@ class _Endless:
         self.running: dict[str, object] = {}
         self.attempts = Attempts(VISITS)
 
+    def weigh(self, worth: object) -> None:
+        """All are worth the same to it."""
+
     def upcoming(self, *_: object) -> Iterator[Assignment]:
         self.plans += 1
         for i in itertools.count():
@@ -508,6 +511,7 @@ def test_a_plan_is_made_when_it_is_as_long_as_it_is_shown() -> None:
         now=lambda: 100.0,
         clock=VirtualClock(lambda: 0.0, AT),
         beliefs=SimpleNamespace(subscribe=lambda learn: None, subscribe_drift=lambda learn: None),
+        worth=np.ones(50),
     )
     schedule = PlantSchedule(plant, found)  # type: ignore[arg-type]
     schedule._states = lambda ready: None  # type: ignore[assignment,method-assign]

@@ -214,7 +214,7 @@ def test_a_time_that_is_too_unsure_is_a_reason(plant: Plant, frame: Frame) -> No
         reasons = looked(cameras, plant.targets[0].name).reasons
     finally:
         cameras.close()
-    assert any("known within 2 s only" in reason for reason in reasons)
+    assert any("known only to within 2 s" in reason for reason in reasons)
 
 
 @pytest.mark.parametrize(
@@ -319,7 +319,7 @@ def test_the_light_on_a_target_is_seen_from_its_front(plant: Plant, frame: Frame
         np.testing.assert_array_equal(again.values, light.values)
         assert "joint visit" in cameras.view(target.name).reading[0]
         script.deviation = 2.0
-        with pytest.raises(FetchError, match="is known within 2 s only"):
+        with pytest.raises(FetchError, match="is known only to within 2 s"):
             asyncio.run(light_on(cameras, target))
     finally:
         cameras.close()

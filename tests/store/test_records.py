@@ -119,10 +119,7 @@ class TestSightings:
     def test_of_nobody_are_refused(self, keeper: Keeper, seen: Sightings) -> None:
         with pytest.raises(
             InputError,
-            match=(
-                "heliostat row 2, but there are only 2 names; pass the names of all heliostats; "
-                "pass the names of all heliostats"
-            ),
+            match=("heliostat row 2, but there are only 2 names; pass the names of all heliostats"),
         ):
             keeper.record_sightings(NAMES[:2], seen)
 

@@ -334,9 +334,9 @@ def test_a_lease_of_automatic_control_may_leave_after_a_person_has_the_authority
     leased(7, 7)
     leased(6, 0, 0.9)  # the plant's own, under which a visit went on
     for token, told in ((6, 7), (7, 0)):
-        with pytest.raises(InvariantError, match="given the authority, which engineer had"):
+        with pytest.raises(InvariantError, match="given the command authority, which engineer had"):
             leased(token, told)
-    with pytest.raises(InvariantError, match="given the authority, which engineer had"):
+    with pytest.raises(InvariantError, match="given the command authority, which engineer had"):
         leased(6, 0, 0.9, OPERATOR)  # the plant has no token of its own while a person commands
 
 
