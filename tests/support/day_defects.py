@@ -144,7 +144,7 @@ ROWS: tuple[
     ((16,), "ROUGH to all reaches a visit", rough_in_a_visit,
      _when("photograph", "rough", 1.0), (), 420.0, True, 8),
     ((4,), "a visit keeps what a person has taken", taken_by_nobody,
-     (CrewAct("duty", "on the way", 1.0, SCRIPT),), (), 420.0, False, 2),
+     (CrewAct("duty", "on the way", 1.0, SCRIPT),), (), 420.0, False, 4),
     ((L2,), "a STOW is done when it is acknowledged", done_at_once,
      _when(ANY_TIME, "off", 60.0), (), 240.0, False, 2),
     ((L3,), "automatic control leaves mirrors at standby", not_tracked_again,

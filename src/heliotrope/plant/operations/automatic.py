@@ -228,7 +228,7 @@ class AutomaticControl:
             plant,
             logbook,
             AUTOMATIC,
-            most=max(1, round(plant.join_rate * settings.beat)),
+            most=max(2, round(plant.join_rate * settings.beat)),
             patience=settings.patience,
             clearance=settings.margin * self.installed,
             wanted=settings.wanted,
