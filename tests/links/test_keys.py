@@ -307,8 +307,7 @@ def test_a_cluster_with_a_key_that_the_plant_has_not_yet_connects_with_the_old_o
             ring = KeyRing(NEW, OLD)
             cluster = tcp_link("127.0.0.1", server.port, "K1", ring, CLOCK, QUICK)
             async with running(cluster):
-                await until(lambda: server.links["K1"].connected)
-                assert cluster.behind
+                await until(lambda: server.links["K1"].connected and cluster.behind)
 
     asyncio.run(main())
 

@@ -303,10 +303,6 @@ class PlantObserver(Judge):
         """Record a DEFOCUS or STOW, which the plant must accept from anyone."""
         self.obeyed(person.name, what, now, ticket.identity)
 
-    def on_call(self, owner: str, act: Act, now: float) -> None:
-        """Record an emergency, which the plant must accept from anyone."""
-        self.obeyed(owner, act.name, now)
-
     def obeyed(self, who: str, what: str, now: float, identity: str = "") -> None:
         """Record a command that the plant must accept from anyone, and may record later.
 

@@ -446,10 +446,16 @@ class Operator:
         return plant.raise_emergency(who.name, act)
 
     def raised(self, who: Person, act: Act) -> None:
-        """Record an emergency that an operator has called."""
+        """Record an emergency that an operator has called.
+
+        An order that adds nothing to the person's own order merges with it and gets no record.
+        """
         self.counts["emergencies"] += 1
+        now, before = self._clock.monotonic(), self._persons.orders.get(who.name)
+        if before is None or act > before[0]:
+            self._observer.obeyed(who.name, act.name, now)
         for each in self.panel.each:
-            each.on_call(who.name, act, self._clock.monotonic())
+            each.on_call(who.name, act, now)
 
     def _one_safe(self, plant: PlantController) -> None:
         what = self._chance.choice(["DEFOCUS", "STOW"])
