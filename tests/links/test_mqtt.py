@@ -360,7 +360,7 @@ def test_a_cancellation_in_the_instant_of_the_answer_is_not_forgotten(
         carrier = plant._carrier  # type: ignore[attr-defined]
         await carrier.open()
         mosquitto.freeze()
-        writing = asyncio.create_task(carrier.write(b"order", None, confirmed=True))
+        writing = asyncio.create_task(carrier.write(b"order", None))
         waiting = carrier._client._pending_publishes
         await until(lambda: len(waiting) == 1)
         await asyncio.sleep(0)

@@ -42,7 +42,7 @@ class Carrier(Protocol):
         """Wait until the next write would be sent at once."""
         ...
 
-    async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
+    async def write(self, envelope: bytes, lifetime: float | None) -> None:
         """Hand an envelope to the transport, which may discard it after ``lifetime`` s."""
         ...
 
@@ -253,7 +253,7 @@ class CarriedLink:
         await self._carrier.ready()
         envelope = self._talk.data(data, expires)
         lifetime = None if expires is None else expires - self._clock.monotonic()
-        await self._carrier.write(envelope, lifetime, confirmed=True)
+        await self._carrier.write(envelope, lifetime)
         self._statistics.sent += 1
         return SendOutcome.SENT
 
@@ -337,7 +337,7 @@ class CarriedLink:
             async with asyncio.timeout(self._settings.period), self._sending:
                 await self._carrier.ready()
                 for envelope in self._talk.beats():
-                    await self._carrier.write(envelope, self._settings.deadline, confirmed=False)
+                    await self._carrier.write(envelope, self._settings.deadline)
 
     async def _watch(self, opened: float) -> None:
         while (until := self._until(opened)) > self._clock.monotonic():

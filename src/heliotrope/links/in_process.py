@@ -205,9 +205,9 @@ class _MemoryCarrier:
         """Return at once, because there is nothing to wait for."""
         self._check()
 
-    async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
+    async def write(self, envelope: bytes, lifetime: float | None) -> None:
         """Put an envelope on the line, which ignores lifetime and confirmation."""
-        del lifetime, confirmed
+        del lifetime
         self._check()
         self._out.put(envelope, self._line.faults)
 

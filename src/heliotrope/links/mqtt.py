@@ -202,22 +202,25 @@ class _MqttCarrier:
         if self._unconfirmed >= _UNCONFIRMED:
             raise LinkLostError(f"the broker left {_UNCONFIRMED} messages unconfirmed")
 
-    async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
-        """Publish an envelope; with ``confirmed``, return once the broker has confirmed it."""
+    async def write(self, envelope: bytes, lifetime: float | None) -> None:
+        """Publish an envelope, and return once the broker has confirmed it.
+
+        Heartbeats are confirmed as well: they then take the way of the orders, and the link is
+        renewed if the broker delivers no more confirmed messages, as after a flood of them.
+        """
         properties = None
         if lifetime is not None:
             properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
             properties.MessageExpiryInterval = max(1, math.ceil(lifetime))
         client = self._connected()
-        self._unconfirmed += confirmed
+        self._unconfirmed += 1
         try:
             await client.publish(
-                self._ends.out, envelope, qos=int(confirmed), retain=False, properties=properties
+                self._ends.out, envelope, qos=1, retain=False, properties=properties
             )
         except aiomqtt.MqttError as error:
             raise LinkLostError(f"the broker did not accept a message ({error})") from None
-        if confirmed:
-            self._unconfirmed = 0
+        self._unconfirmed = 0
 
     async def read(self) -> bytes:
         """Wait for the next envelope that the broker did not retain."""

@@ -264,9 +264,9 @@ class _TcpCarrier:
         """Wait until everything written has left this process."""
         await self._connected().ready()
 
-    async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
+    async def write(self, envelope: bytes, lifetime: float | None) -> None:
         """Write an envelope; TCP ignores lifetime and confirmation."""
-        del lifetime, confirmed
+        del lifetime
         self._connected().write(envelope)
 
     async def read(self) -> bytes:
