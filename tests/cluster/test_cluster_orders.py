@@ -939,6 +939,31 @@ def test_alarms_are_repeated_and_listed_since_each_may_be_lost() -> None:
     run(main)
 
 
+def test_a_status_with_names_lists_the_commands_that_have_not_ended() -> None:
+    reports = Reports()
+    status = ClusterStatus("C", 0, 0.0, "gps", 0.0, 3.0, 0.1)
+
+    def listed(*names: str) -> ClusterStatus:
+        reports.status(dataclasses.replace(status, names=names))
+        last = reports.take()[-1]
+        assert isinstance(last, ClusterStatus)
+        return last
+
+    for identity, stage, heliostat in (
+        ("one", Stage.ACCEPTED, "A"),
+        ("two", Stage.ACKNOWLEDGED, "A"),
+        ("two", Stage.ACKNOWLEDGED, "B"),
+        ("two", Stage.SENT, "B"),
+        ("two", Stage.DONE, "A"),
+        ("", Stage.ACKNOWLEDGED, "A"),
+    ):
+        reports.add(identity, stage, heliostat)
+    assert not listed().commands_listed
+    assert (listed("A", "B").commands, listed("A", "B").commands_listed) == (("two",), True)
+    reports.add("two", Stage.FAILED, "B", "a test")
+    assert (listed("A", "B").commands, listed("A", "B").commands_listed) == ((), True)
+
+
 def test_a_status_is_not_delivered_later_than_the_next_one_is_due() -> None:
     async def main(field: Field) -> None:
         send, left = field.link.send, list[float]()

@@ -587,6 +587,33 @@ def test_a_plant_tells_the_end_of_an_alarm_that_its_cluster_no_longer_lists(tmp_
     play(tmp_path, scene)
 
 
+def test_a_command_ends_that_its_cluster_no_longer_lists(tmp_path: Path) -> None:
+    """Simulated runs 10030, 10008: a cluster restarted, or its report of the end was lost."""
+
+    async def scene(bench: Bench) -> None:
+        token = await bench.commanded()
+        cluster = bench.clusters["pod-1"]
+        cluster.deaf.update(("P1A", "P1B"))
+        ticket = bench.plant.command(OPERATOR, token, "APPROACH", ("P1A", "P1B", "P2A"))
+        await bench.wait(1.0)
+        (sent,) = cluster.commands("APPROACH")
+        await cluster.send(Progress(sent.identity, Stage.ACKNOWLEDGED, ("P1A",)))
+        status = ClusterStatus("pod-1", 0, 0.0, "gps", 0.0, 3.0, 0.1)
+        lists = replace(status, commands_listed=True)
+        for each in (status, replace(lists, commands=(sent.identity,))):
+            await cluster.send(each)
+            await bench.wait(1.0)
+            assert ticket.counted() == {"sent": 1, "acknowledged": 1, "done": 1}
+        await cluster.send(lists)
+        await bench.wait(1.0)
+        assert ticket.counted() == {"sent": 1, "done": 1, "failed": 1}
+        assert ticket.refusals == {
+            "P1A": "acknowledged, but the report of its end was lost, or the cluster restarted"
+        }
+
+    play(tmp_path, scene)
+
+
 def test_a_plant_that_does_not_hold_together_is_refused(tmp_path: Path) -> None:
     async def main(clock: VirtualClock) -> None:
         with pytest.raises(InputError, match="sensor wind: no row"):

@@ -9,6 +9,7 @@ from heliotrope.safety import Alarm
 
 #: Messages that may wait; the oldest are dropped first. Only the newest status is kept.
 _CAPACITY = 256
+_FINAL = (Stage.DONE, Stage.REFUSED, Stage.FAILED)
 
 
 class Reports:
@@ -16,7 +17,7 @@ class Reports:
 
     The same stage of one command at several heliostats becomes one message. An alarm is reported
     when it changes, and again at intervals while it is active. A status with names lists the active
-    alarms.
+    alarms, and the commands that were acknowledged and have not ended.
     """
 
     def __init__(self) -> None:
@@ -24,12 +25,21 @@ class Reports:
         self._out: deque[Message] = deque(maxlen=_CAPACITY)
         self._status: ClusterStatus | None = None
         self._alarms: dict[tuple[str, str], Alarm] = {}
+        #: Heliostats that acknowledged a command and have not ended it, by the command's identity.
+        self._open: dict[str, set[str]] = {}
         self._published = asyncio.Event()
 
     def add(self, identity: str, stage: Stage, heliostat: str = "", text: str = "") -> None:
         """Report a stage of a command; a command without identity is the cluster's own command."""
-        if identity:
-            self._groups.setdefault((identity, stage, text), []).append(heliostat)
+        if not identity:
+            return
+        self._groups.setdefault((identity, stage, text), []).append(heliostat)
+        if stage is Stage.ACKNOWLEDGED:
+            self._open.setdefault(identity, set()).add(heliostat)
+        elif stage in _FINAL and (left := self._open.get(identity)) is not None:
+            left.discard(heliostat)
+            if not left:
+                del self._open[identity]
 
     def answer(self, answer: Answer) -> None:
         """Report a reply to a query."""
@@ -92,8 +102,14 @@ class Reports:
         return messages
 
     def _listing(self, status: ClusterStatus) -> ClusterStatus:
-        """Return a status; if it contains names, the currently active alarms are added."""
+        """Return a status; if it contains names, the alarms and commands in progress are added."""
         if not status.names:
             return status
         listed = tuple(f"{condition} {subject}" for condition, subject in self._alarms)
-        return replace(status, alarms=listed, alarms_listed=True)
+        return replace(
+            status,
+            alarms=listed,
+            alarms_listed=True,
+            commands=tuple(self._open),
+            commands_listed=True,
+        )

@@ -213,7 +213,8 @@ class ClusterStatus:
     ``run`` is the plant run that the cluster belongs to, ``barred`` lists the runs that get no
     lease. A status with names also lists the active ``alarms`` of the cluster, each as "condition
     subject", and ``alarms_listed`` is true; an alarm that is not listed has cleared, even if the
-    clearing message was lost.
+    clearing message was lost. In the same way it lists, with ``commands_listed``, the identities of
+    the ``commands`` that were acknowledged and have not ended.
     """
 
     kind: ClassVar[str] = "status"
@@ -233,6 +234,8 @@ class ClusterStatus:
     alarms: tuple[str, ...] = ()
     alarms_listed: bool = False
     settings: str = ""
+    commands: tuple[str, ...] = ()
+    commands_listed: bool = False
 
     def nodes(self) -> "npt.NDArray[Any]":
         """Return the rows, of dtype `NODE`, read-only.

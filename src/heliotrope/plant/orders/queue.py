@@ -12,7 +12,14 @@ from heliotrope.files.disk import Disk, DiskBusyError, Work
 from heliotrope.lcu import messages
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.link import SendOutcome
-from heliotrope.links.messages import Command, Emergency, Parameters, Progress, Stage
+from heliotrope.links.messages import (
+    ClusterStatus,
+    Command,
+    Emergency,
+    Parameters,
+    Progress,
+    Stage,
+)
 from heliotrope.plant.field.assigned import AssignedError
 from heliotrope.plant.field.clusters import ClusterEnd, Clusters
 from heliotrope.plant.field.part import Part
@@ -39,6 +46,8 @@ _BATCH, _TURN = 256, 0.5
 _HEARD = 3.0
 #: Commands that move nothing by themselves: an emergency does not overtake them.
 _STILL = messages.POINTS | {"PARAMETERS"}
+#: Reason for a command of which the cluster knows no more.
+_LOST = "acknowledged, but the report of its end was lost, or the cluster restarted"
 #: Time allowed at the end of the plant's run for the overdue records, s.
 _LAST = 10.0
 
@@ -583,6 +592,21 @@ class PlantOrders(Part):
             return False
         young = self.clock.monotonic() - self.authority.changed_at < _HEARD
         return young or under.token != own
+
+    def on_status(self, cluster: str, status: ClusterStatus, now: float) -> None:
+        """End acknowledged commands that a cluster no longer lists.
+
+        The cluster has restarted, or its report of the end was lost.
+        """
+        del now
+        if not status.commands_listed:
+            return
+        for identity in self._under.keys() - set(status.commands):
+            under = self._under[identity]
+            if under.cluster == cluster and not under.ticket.finished:
+                ended = set(under.ticket.waiting(under.heliostats))
+                ended.difference_update(under.ticket.unacknowledged())
+                under.ticket.advance(ended, Stage.FAILED, _LOST)
 
     def on_beat(self, now: float) -> None:
         """End commands without a reply in time; record the results of ended tickets."""

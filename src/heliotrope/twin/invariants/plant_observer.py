@@ -18,7 +18,6 @@ from heliotrope.plant.operations.automatic import AUTOMATIC
 from heliotrope.plant.orders.authority import Person, Role
 from heliotrope.plant.orders.tickets import Ticket
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.safety import Act
 from heliotrope.twin.invariants.invariants import Judge, Observer
 from heliotrope.twin.records import RecordsDisk
 
