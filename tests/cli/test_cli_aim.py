@@ -142,6 +142,14 @@ def test_a_uniform_flux_and_a_ramp_are_told(aim: Any) -> None:
     assert len({row["joins_s"] for row in rows}) > 1
 
 
+def test_the_limit_that_a_refusal_advises_holds(aim: Any) -> None:
+    code, _, err = aim("--limit=5")
+    assert code == 2
+    advised = err.split("raise the limit there to ")[1].split()[0]
+    code, _, err = aim(f"--limit={advised}")
+    assert code == 0, err
+
+
 def test_a_limit_over_temperature_and_velocity_lies_on_the_panels(aim: Any) -> None:
     Path("afd.csv").write_text(
         "temperature_c,velocity_m_s,flux_w_m2\n290,2,160000\n565,2,80000\n", encoding="utf-8"

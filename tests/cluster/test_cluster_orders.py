@@ -949,7 +949,7 @@ def test_a_status_with_names_lists_the_commands_that_have_not_ended() -> None:
         assert isinstance(last, ClusterStatus)
         return last
 
-    for identity, stage, heliostat in (
+    for identity, stage, name in (
         ("one", Stage.ACCEPTED, "A"),
         ("two", Stage.ACKNOWLEDGED, "A"),
         ("two", Stage.ACKNOWLEDGED, "B"),
@@ -957,7 +957,7 @@ def test_a_status_with_names_lists_the_commands_that_have_not_ended() -> None:
         ("two", Stage.DONE, "A"),
         ("", Stage.ACKNOWLEDGED, "A"),
     ):
-        reports.add(identity, stage, heliostat)
+        reports.add(identity, stage, name)
     assert not listed().commands_listed
     assert (listed("A", "B").commands, listed("A", "B").commands_listed) == (("two",), True)
     reports.add("two", Stage.FAILED, "B", "a test")

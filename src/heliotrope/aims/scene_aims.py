@@ -31,6 +31,8 @@ ROUNDS, BELOW = 16, 5e-4
 FREE = 5
 #: From then on the remaining excess times this factor is subtracted from the limit.
 BEYOND = 1.5
+#: Number of steps in which the limits that would hold are found.
+RAISES = 8
 #: Minimum share of the limit left to the next choice after errors; excess that counts as zero.
 LEAST, HOLDS = 0.02, 1e-3
 #: Sweeps of every choice after the first, and the gap with which a choice from a start ends.
@@ -419,7 +421,7 @@ def _refuse(scene: Scene, trial: SceneAims, demand: Demand, what: str, advice: s
     """Raise InputError: where the limit is exceeded most, by how much, and what would hold."""
     over = trial.quantile / trial.limit
     cell = tuple(int(n) for n in np.unravel_index(over.argmax(), over.shape))
-    enough = trial.quantile[cell] / (1.0 - demand.limit.margin)
+    enough = _raised(trial, demand).limit[cell] / (1.0 - demand.limit.margin)
     hint = f"; {demand.limit.unit_hint}" if demand.limit.unit_hint else ""
     raise InputError(
         f"receiver {surface_in(scene).name}: {what}; {_place(scene, cell)} gets "
@@ -427,6 +429,19 @@ def _refuse(scene: Scene, trial: SceneAims, demand: Demand, what: str, advice: s
         f"are due to errors, {_percent(trial.excess)} above its {1e-3 * trial.limit[cell]:.4g}; "
         f"raise the limit there to {1e-3 * enough:.4g} kW/m²{advice}{hint}"
     )
+
+
+def _raised(trial: SceneAims, demand: Demand) -> SceneAims:
+    """Return aims under limits raised until they hold; see `_refuse`.
+
+    The allowance for errors depends on the limits, because it counts the room of all cells.
+    """
+    for _ in range(RAISES):
+        if trial.excess <= HOLDS:
+            break
+        limit = as_float(trial.limit * (1.0 + trial.excess))
+        trial = replace(trial, limit=limit, risk=risk_of(trial.engine, demand, limit))
+    return trial
 
 
 def _percent(excess: float) -> str:
