@@ -431,14 +431,14 @@ def events(
 ) -> None:
     """Print the latest events since the start of the plant, newest first."""
     with _client(context) as client:
-        found = client.get(f"events?limit={limit}")
-        for event in found if all_names else ():
+        events = client.get(f"events?limit={limit}")
+        for event in events if all_names else ():
             if event["heliostats"]:
                 event["names"] = client.get(f"events/{event['number']}/heliostats")
     if as_json:
-        print_json(found)
+        print_json(events)
         return
-    for event in found:
+    for event in events:
         print(
             "  ".join(filter(None, (_utc(event["at"]), event["kind"], event["who"], event["text"])))
         )
@@ -476,8 +476,8 @@ def journal(
         if moment:
             query[name] = f"{parse_time(moment).timestamp():.3f}"
     with _client(context) as client:
-        found = client.get(f"journal?{urlencode(query)}")
-    rows = [(_utc(entry["at"]), entry["kind"], entry["what"], entry["text"]) for entry in found]
+        entries = client.get(f"journal?{urlencode(query)}")
+    rows = [(_utc(entry["at"]), entry["kind"], entry["what"], entry["text"]) for entry in entries]
     if as_csv:
         csv.writer(sys.stdout).writerows((("time", "kind", "what", "text"), *rows))
         return
@@ -502,8 +502,8 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Print the shift report: production, availability, calibrations, alarms, work, notes."""
-    given = {"since": since, "until": until}
-    times = [f"{name}={parse_time(at).timestamp():.3f}" for name, at in given.items() if at]
+    bounds = {"since": since, "until": until}
+    times = [f"{name}={parse_time(at).timestamp():.3f}" for name, at in bounds.items() if at]
     with _client(context) as client:
         answer = client.get("?".join(filter(None, ("report", "&".join(times)))))
     if as_json:
@@ -512,10 +512,10 @@ def report(
     print(f"{answer['plant']}, {_utc(answer['since'])} to {_utc(answer['until'])}")
     hours = answer["recorded"] / 3600.0
     print(f"records cover {hours:.1f} h of this period, {answer['daylight'] / 3600.0:.1f} h by day")
-    for one in answer["production"]:
+    for receiver in answer["production"]:
         print(
-            f"{one['receiver']}: {one['energy'] / 3.6e9:.3f} MWh predicted, peak "
-            f"{one['peak'] / 1e6:.2f} MW at {_utc(one['peak_at'])}"
+            f"{receiver['receiver']}: {receiver['energy'] / 3.6e9:.3f} MWh predicted, peak "
+            f"{receiver['peak'] / 1e6:.2f} MW at {_utc(receiver['peak_at'])}"
         )
     if answer["availability"] is not None:
         print(f"availability {answer['availability']:.1%}; heliostat hours lost:")
@@ -527,16 +527,17 @@ def report(
     print_table(("visits", "number"), rows, "calibrations")
     for name in ("alarms", "locks", "work", "notes"):
         print(f"{name}: {len(answer[name])}")
-        for one in answer[name]:
-            print(f"  {_utc(one.get('at') or one.get('raised') or one['since'])}  {_line(one)}")
+        for entry in answer[name]:
+            at = entry.get("at") or entry.get("raised") or entry["since"]
+            print(f"  {_utc(at)}  {_line(entry)}")
 
 
-def _line(one: dict[str, Any]) -> str:
+def _line(entry: dict[str, Any]) -> str:
     """Return an alarm, a lock or an entry of the journal in one line."""
-    if "who" in one:
-        return f"{one['kind']} {one['name']}: {one['reason']} ({one['who']})"
-    over = f"; cleared at {_utc(one['cleared'])}" if one.get("cleared") else ""
-    return f"{one.get('condition', '')} {one['text']}{over}".strip()
+    if "who" in entry:
+        return f"{entry['kind']} {entry['name']}: {entry['reason']} ({entry['who']})"
+    over = f"; cleared at {_utc(entry['cleared'])}" if entry.get("cleared") else ""
+    return f"{entry.get('condition', '')} {entry['text']}{over}".strip()
 
 
 @app.command()
@@ -567,8 +568,8 @@ def trend(
     with _client(context) as client:
         if not quantity:
             rows = [
-                (one["name"], one["unit"], "heliostat" if one["heliostat"] else "plant")
-                for one in client.get("trends")
+                (trend["name"], trend["unit"], "heliostat" if trend["heliostat"] else "plant")
+                for trend in client.get("trends")
             ]
             print_table(("quantity", "unit", "of"), rows)
             return
@@ -1000,22 +1001,22 @@ def _decide_plant_file(
 
 def _check_plant_file(client: "AtPlant | Client", path: Path, as_json: bool) -> None:
     """Print what the plant finds in a text; the exit code is 1 if it cannot be stored."""
-    found = client.ask("POST", "plant-file/check", {"text": _toml_of(path)})
+    answer = client.ask("POST", "plant-file/check", {"text": _toml_of(path)})
     if as_json:
-        print_json(found)
+        print_json(answer)
     else:
-        for one in found["findings"]:
-            line = f"line {one['line']}: " if one["line"] else ""
-            print(f"{one['severity']}: {line}{one['text']}")
-        print("\n".join(found["difference"]) or "no difference from the current file")
-        _print_differs(found["differs"])
-        if found["good"]:
+        for finding in answer["findings"]:
+            line = f"line {finding['line']}: " if finding["line"] else ""
+            print(f"{finding['severity']}: {line}{finding['text']}")
+        print("\n".join(answer["difference"]) or "no difference from the current file")
+        _print_differs(answer["differs"])
+        if answer["good"]:
             print(
                 "takes effect immediately"
-                if found["at_once"]
+                if answer["at_once"]
                 else "takes effect when the plant restarts"
             )
-    if not found["good"]:
+    if not answer["good"]:
         raise typer.Exit(1)
 
 

@@ -36,9 +36,9 @@ class Reports:
         self._groups.setdefault((identity, stage, text), []).append(heliostat)
         if stage is Stage.ACKNOWLEDGED:
             self._open.setdefault(identity, set()).add(heliostat)
-        elif stage in _FINAL and (left := self._open.get(identity)) is not None:
-            left.discard(heliostat)
-            if not left:
+        elif stage in _FINAL and (members := self._open.get(identity)) is not None:
+            members.discard(heliostat)
+            if not members:
                 del self._open[identity]
 
     def answer(self, answer: Answer) -> None:
