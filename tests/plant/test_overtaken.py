@@ -19,9 +19,9 @@ def confirmed_late(bench: Bench, cluster: str, seconds: float) -> None:
     carrier = bench.links[cluster]._carrier
     real = carrier.write
 
-    async def write(envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
-        await real(envelope, lifetime, confirmed=confirmed)
-        await asyncio.sleep(seconds if confirmed else 0.0)
+    async def write(envelope: bytes, lifetime: float | None) -> None:
+        await real(envelope, lifetime)
+        await asyncio.sleep(seconds)
 
     carrier.write = write
 
