@@ -77,13 +77,14 @@ def _named_test_exists(line: str) -> bool:
 
 
 def _source_of(line: str) -> str:
-    """Return the source of a test that is named, or of the whole file."""
+    """Return the source of a named test with its parameters, or of the whole file."""
     path, _, name = shlex.split(line)[1].partition("::")
     text = (ROOT / path).read_text(encoding="utf-8")
     made = [
-        ast.get_source_segment(text, node)
+        ast.get_source_segment(text, part)
         for node in ast.walk(ast.parse(text))
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.name == name
+        for part in (*node.decorator_list, node)
     ]
     return "\n".join(one for one in made if one) if name else text
 
