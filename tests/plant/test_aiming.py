@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from types import SimpleNamespace
 
 import numpy as np
@@ -540,14 +541,23 @@ def test_before_the_night_the_field_leaves_along_the_ramp(
     played(scene, sensors=(DNI_READING,), ramp=ramp / every)
 
 
-@pytest.mark.parametrize(("lowest", "before"), [(0.2, np.inf), (0.3, 40.0), (0.4, np.inf)])
-def test_the_ramp_ends_two_rounds_before_the_sun_is_too_low(lowest: float, before: float) -> None:
+@pytest.mark.parametrize(
+    ("lowest", "seconds", "before"),
+    [(0.2, 60.0, np.inf), (0.3, 60.0, 40.0), (0.4, 60.0, np.inf), (0.3, 1e12, 40.0)],
+)
+def test_the_ramp_ends_two_rounds_before_the_sun_is_too_low(
+    monkeypatch: pytest.MonkeyPatch, lowest: float, seconds: float, before: float
+) -> None:
     # The sine of the sun's elevation falls from 0.35 by 0.05 in 70 s.
-    limit, every = FluxLimit(LIMIT), 15.0
-    settings = AimSettings("limit", limit, ramp=LIMIT / 60.0, every=every)
-    heights = SimpleNamespace(sun_vector=lambda ahead: [0.0, 0.0, 0.35 - 0.05 * ahead / 70.0])
+    monkeypatch.setattr(
+        aiming, "vector", lambda utc, _: np.outer(0.35 - 0.05 * utc / 70.0, (0.0, 0.0, 1.0))
+    )
+    settings = AimSettings("limit", FluxLimit(LIMIT), ramp=LIMIT / seconds, every=15.0)
+    start = SimpleNamespace(utc=lambda: datetime.fromtimestamp(0.0, UTC))
     part = SimpleNamespace(
-        _settings=settings, _automatic=SimpleNamespace(lowest=np.arcsin(lowest)), _plant=heights
+        _settings=settings,
+        _automatic=SimpleNamespace(lowest=np.arcsin(lowest)),
+        _plant=SimpleNamespace(clock=start, design=SimpleNamespace(site=None)),
     )
     found = aiming.Aiming._before_night(part)  # type: ignore[arg-type]
     assert found == pytest.approx(before, abs=aiming.STEP)

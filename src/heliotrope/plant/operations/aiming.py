@@ -50,7 +50,7 @@ from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.workers import Worker
 from heliotrope.safety import alarms
 from heliotrope.store.records import Records, StoreError
-from heliotrope.sun import clear_sky
+from heliotrope.sun import clear_sky, vector
 
 #: Time for which a beam without reports may still be where it was last reported, s.
 HOLD = 120.0
@@ -67,8 +67,8 @@ BLOCKED = 300.0
 BRIGHT = 1.15
 #: The sun shines above this fraction of the irradiance under a usual clear sky.
 SUNNY = 0.5
-#: Step of the search for the time at which the field stows, s.
-STEP = 10.0
+#: Step of the search for the time at which the field stows, and how far ahead it looks at most, s.
+STEP, DAY = 10.0, 86_400.0
 #: Time between two rounds while heliostats wait for the ramp, s.
 SOON = 3.0
 #: Time for which a limit stays lowered after a measured flux was above it, s.
@@ -441,11 +441,12 @@ class Aiming:
         lowest = math.sin(self._automatic.lowest)
         longest = float(np.max(self._settings.limit.flux)) / self._settings.ramp
         longest += 2.0 * self._settings.every  # a round takes effect in the next
-        ahead = np.arange(0.0, longest + STEP, STEP)
-        low = [self._plant.sun_vector(float(time))[2] < lowest for time in ahead]
-        if low[0] or not any(low):
+        ahead = np.arange(0.0, min(longest, DAY) + STEP, STEP)
+        utc, site = self._plant.clock.utc().timestamp(), self._plant.design.site
+        low = vector(utc + ahead, site)[:, 2] < lowest
+        if low[0] or not low.any():
             return math.inf
-        return max(float(ahead[low.index(True)]) - 2.0 * self._settings.every, 0.0)
+        return max(float(ahead[low.argmax()]) - 2.0 * self._settings.every, 0.0)
 
     def _clear_sky(self) -> float:
         """Return the irradiance under a usual clear sky, W/m²."""
