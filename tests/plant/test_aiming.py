@@ -248,14 +248,19 @@ def test_a_limit_that_no_aims_hold_later_leaves_the_last_good_aims(
     played(scene)
 
 
+@pytest.mark.parametrize("blocked", [0, 1])
 def test_beams_that_a_program_finds_leave_where_no_aims_ever_hold_the_limit(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, blocked: int
 ) -> None:
-    """As after a restart with a wrong limit in the plant file."""
+    """As after a restart with a wrong limit in the plant file; some may not go to standby."""
 
     async def scene(made: LivePlant) -> None:
         await up(made)
         part = made.operations._aiming
+        kept = sorted(made.operations.automatic.aims)[:blocked]
+        monkeypatch.setattr(
+            made.plant.guards.identities, "blocked", lambda name: "a test" if name in kept else None
+        )
         monkeypatch.setattr(aiming.Aiming, "_allowed", lambda self, limit, scene: FluxLimit(100.0))
         part._answer, part._source = None, ""
         await asyncio.sleep(60.0)

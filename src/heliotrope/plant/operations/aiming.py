@@ -479,10 +479,10 @@ class Aiming:
         apart = ~(np.linalg.norm(self._plant.aims - safe, axis=1) < 0.05)
         rows = np.flatnonzero(on & apart)
         self._automatic.aims.clear()
-        if await self._rest(rows):
-            names = self._plant.field.names
-            some = np.flatnonzero(np.isfinite(safe).all(axis=1))
-            self._automatic.aims.update({names[row]: safe[row] for row in some})
+        await self._rest(rows)
+        names = self._plant.field.names
+        some = np.flatnonzero(np.isfinite(safe).all(axis=1))
+        self._automatic.aims.update({names[row]: safe[row] for row in some})
 
     # -- the field -------------------------------------------------------------------------
 
@@ -587,8 +587,7 @@ class Aiming:
             rests = np.asarray(~np.isfinite(move.aims).all(axis=1))
             for row in move.rows[rests]:
                 aims.pop(names[row], None)
-            if not await self._rest(move.rows[rests & on & free]):
-                return
+            await self._rest(move.rows[rests & on & free])
             pairs = zip(move.rows, move.aims, on, rests, strict=True)
             goes = [(names[row], aim, shines) for row, aim, shines, rest in pairs if not rest]
             aims.update({name: aim for name, aim, shines in goes if not shines})
@@ -615,26 +614,25 @@ class Aiming:
         self._note(tuple(points.keys() - refused.keys()))
         return not refused
 
-    async def _rest(self, rows: npt.NDArray[np.intp]) -> bool:
-        """Take beams off the receiver; return whether the order was accepted.
+    async def _rest(self, rows: npt.NDArray[np.intp]) -> None:
+        """Take beams off the receiver.
 
-        They go to standby, or turn away where new motions are refused, as after many failures:
-        a limit must hold then too.
+        They go to standby, or turn away where that is refused, as after many failures: a limit must
+        hold then too.
         """
         names = tuple(self._plant.field.names[row] for row in rows)
         if not names:
-            return True
+            return
         try:
-            try:
-                ticket = self._automatic.rest(names)
-            except RefusedError:
-                ticket = self._automatic.turn_away(names)
-        except HeliotropeError as error:
-            self._block(getattr(error, "refusals", dict.fromkeys(names, str(error))))
-            return False
-        await ticket.end(MOVED)
+            tickets = [self._automatic.rest(names)]
+            refused = tuple(tickets[0].blocked)
+        except RefusedError:
+            tickets, refused = [], names
+        if refused:
+            tickets.append(self._automatic.turn_away(refused))
+        for ticket in tickets:
+            await ticket.end(MOVED)
         self._note(names)
-        return True
 
     def _block(self, refused: dict[str, str]) -> None:
         for name in refused:
