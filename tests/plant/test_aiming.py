@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from heliotrope.aims.heating import Heating
-from heliotrope.aims.rounds import Heat, forget
+from heliotrope.aims.rounds import Heat, Move, forget
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.aim_settings import AimSettings
 from heliotrope.field.flux_limit import FluxLimit
@@ -324,6 +324,25 @@ def test_while_an_operator_commands_the_flux_is_watched_and_nothing_moves() -> N
         assert (view.peak, view.power) == (0.0, 0.0)
         assert view.idle == "an emergency is active"
         assert not texts(made, "flux_above_limit", active=True)
+
+    played(scene)
+
+
+def test_a_beam_is_not_moved_in_a_visit_that_began_after_the_aims_were_chosen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        part, automatic = made.operations._aiming, made.operations.automatic
+        first, second = sorted(automatic.aims)[:2]
+        visiting = property(lambda self: frozenset({first}))
+        for name, moves in ((first, False), (second, True)):
+            row = made.plant.field.place(name)
+            with monkeypatch.context() as patch:
+                patch.setattr(type(automatic), "visiting", visiting)
+                moved = automatic.aims[name] + (0.0, 0.0, 0.2)
+                await part._go((Move(np.array([row]), moved[None]),))
+            assert np.allclose(made.plant.aims[row], moved) == moves
 
     played(scene)
 

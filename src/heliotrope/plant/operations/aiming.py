@@ -576,18 +576,22 @@ class Aiming:
     # -- moves -----------------------------------------------------------------------------
 
     async def _go(self, moves: tuple[Move, ...]) -> None:
-        """Make the moves one after the other; after a failed move, wait for the next round."""
+        """Make the moves one after the other.
+
+        Wait for the next round after a failed move, and where a beam may no longer be moved, as in
+        a visit that has begun since.
+        """
         until = self._plant.now() + 2.0 * self._settings.every
         names, aims = self._plant.field.names, self._automatic.aims
         for move in moves:
-            if self._plant.now() > until or self._automatic.idle:
+            now = self._plant.now()
+            on, free = (mask[move.rows] for mask in (self._on(now), self._movers(now)))
+            if now > until or self._automatic.idle or (on & ~free).any():
                 return
-            on = self._on(self._plant.now())[move.rows]
-            free = self._movers(self._plant.now())[move.rows]
             rests = np.asarray(~np.isfinite(move.aims).all(axis=1))
             for row in move.rows[rests]:
                 aims.pop(names[row], None)
-            await self._rest(move.rows[rests & on & free])
+            await self._rest(move.rows[rests & on])
             pairs = zip(move.rows, move.aims, on, rests, strict=True)
             goes = [(names[row], aim, shines) for row, aim, shines, rest in pairs if not rest]
             aims.update({name: aim for name, aim, shines in goes if not shines})
