@@ -328,6 +328,22 @@ def test_while_an_operator_commands_the_flux_is_watched_and_nothing_moves() -> N
     played(scene)
 
 
+def test_a_late_failure_leaves_the_field_to_the_operator_who_has_just_taken_it() -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        part, before = made.operations._aiming, made.plant.aims.copy()
+        tracks = made.plant.field.among((states.TRACKING,), made.plant.now())
+        made.operations.automatic.give_way()
+        made.plant.take_authority(Person("Olga", Role.OPERATOR))
+        part._answer, part._good_at = None, -np.inf
+        await part._failed("a test")
+        assert (made.plant.field.among((states.TRACKING,), made.plant.now()) == tracks).all()
+        np.testing.assert_array_equal(made.plant.aims, before)
+        assert made.operations.aims().problem == "a test"
+
+    played(scene)
+
+
 def test_a_beam_is_not_moved_in_a_visit_that_began_after_the_aims_were_chosen(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -458,14 +458,17 @@ class Aiming:
         return self._plant.sentinel.table.shown(now).get(DNI_READING, math.nan)
 
     async def _failed(self, problem: str) -> None:
-        """Keep the last good aims; once these are too old, go to the safe spread."""
+        """Keep the last good aims; once these are too old, go to the safe spread.
+
+        An operator who has taken the command authority while they were computed keeps the field.
+        """
         if not self._problem:
             self._log.take_alarm(alarms.AIMS.raised(problem=problem))
         self._problem = problem
         late = self._plant.now() - self._good_at
         if late < SAFE * self._settings.deadline:
             self._source = "" if self._answer is None else "last good aims"
-        elif self._source != "safe spread":
+        elif self._source != "safe spread" and not self._automatic.idle:
             self._source = "safe spread"
             nowhere = np.full((len(self._plant.field), 3), np.nan)
             await self._to_safe(nowhere if self._answer is None else self._answer.safe)
