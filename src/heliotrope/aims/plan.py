@@ -268,9 +268,10 @@ def plan_aims(
         None if wanted is None else FluxLimit.of(wanted),
         give,
     )
-    options = {"sun": optics.shape, "air": optics.air, "gaussians": optics.gaussians}
-    begin = None if start is None else start.scene
-    aimed = aim_scene(scene, demand, strategy=strategy, start=begin, progress=progress, **options)
+    aimed = aim_scene(
+        scene, demand, strategy=strategy, start=None if start is None else start.scene,
+        progress=progress, sun=optics.shape, air=optics.air, gaussians=optics.gaussians,
+    )  # fmt: skip
     result = result_of(plant, aimed.engine.scene, aimed.engine)
     lit = aimed.field.power.max(axis=1) > 0.0
     defocused, unlimited = aimed.defocused & ~off & lit, aimed.field.middle_power

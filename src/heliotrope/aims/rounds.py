@@ -220,10 +220,9 @@ def next_round(now: Round, **light: Any) -> Answer:
     rows, columns = surface_in(now.scene).shape
     limit = now.demand.limit.on(rows, columns)
     fixed, room = _room(now, limit, light)
-    demand = replace(now.demand, limit=type(now.demand.limit)(room))
     best, target_aims, problem = None, now.aims, ""
     try:
-        best = _best(now, demand, light)
+        best = _best(now, room, light)
         target_aims = np.where((now.free & ~best.defocused)[:, None], best.aims, np.nan)
     except InputError:
         if not (problem := _kept(now, fixed, limit)):
@@ -490,8 +489,8 @@ class _Walk:
         return [_rest(np.array(resting, dtype=np.intp))] if resting else []
 
 
-def _best(now: Round, demand: Demand, light: dict[str, Any]) -> SceneAims:
-    """Return the aims of maximum power.
+def _best(now: Round, room: FloatArray, light: dict[str, Any]) -> SceneAims:
+    """Return the aims of maximum power in the room that beams which stay leave.
 
     The search starts from this process's earlier aims if they fit the scene.
     """
@@ -504,7 +503,7 @@ def _best(now: Round, demand: Demand, light: dict[str, Any]) -> SceneAims:
         # Images of mirrors that were dark are empty.
         if same and 0.0 <= now.at - before_at < FRESH and not (now.free & ~were_free).any():
             at, start = before_at, before
-    computed = aim_scene(scene, demand, start=start, **light)
+    computed = aim_scene(scene, now.demand, room=room, start=start, **light)
     _last[:] = [(at, now.free, computed)]
     return computed
 
