@@ -262,7 +262,7 @@ def plan_aims(
         FluxLimit.of(limit),
         probability,
         shared or SharedErrors(),
-        np.unique(_clusters(plant), return_inverse=True)[1],
+        np.unique(plant.cluster, return_inverse=True)[1],
         np.array([0.0, np.cos(latitude), np.sin(latitude)]),
         keep,
         None if wanted is None else FluxLimit.of(wanted),
@@ -279,14 +279,9 @@ def plan_aims(
     return AimPlan(strategy, result, defocused, beyond, others, lost, unlimited, aimed)
 
 
-def _clusters(plant: Plant) -> list[str]:
-    """Return the cluster of each heliostat; "" without one."""
-    return [name for group in plant.groups.values() for name in group.cluster]
-
-
 def _named(plant: Plant, names: Iterable[str]) -> npt.NDArray[np.bool_]:
     """Return a mask of the heliostats that are named, or whose cluster is, (N,)."""
-    mask, clusters = np.zeros(len(plant), dtype=np.bool_), np.array(_clusters(plant))
+    mask, clusters = np.zeros(len(plant), dtype=np.bool_), np.array(plant.cluster)
     heliostats = np.array(plant.names)
     for name in names:
         here = (heliostats == name) | ((clusters == name) & (clusters != ""))
