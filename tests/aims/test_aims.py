@@ -462,7 +462,7 @@ def test_heliostats_without_a_cluster_err_like_those_of_one_cluster() -> None:
             replace(plant, groups={"azel": replace(azel, cluster=cluster)}),
             sun=sun,
             limit=6e4,
-            without=("P1A",),
+            without="P1A",
         )
         for cluster in ((), ("pod",) * len(azel))
     )

@@ -221,7 +221,7 @@ def plan_aims(
     give
         Fraction of the power that may be sacrificed for the wanted map, 0 to 0.5.
     without
-        Names of lost heliostats and clusters, which send no light.
+        Lost heliostats and clusters, one name or several; they send no light.
     start
         A plan of the same plant and receiver for another sun position, irradiance or limit, or with
         other heliostats lost, from which the search begins.
@@ -283,7 +283,7 @@ def _named(plant: Plant, names: Iterable[str]) -> npt.NDArray[np.bool_]:
     """Return a mask of the heliostats that are named, or whose cluster is, (N,)."""
     mask, clusters = np.zeros(len(plant), dtype=np.bool_), np.array(plant.cluster)
     heliostats = np.array(plant.names)
-    for name in names:
+    for name in (names,) if isinstance(names, str) else names:
         here = (heliostats == name) | ((clusters == name) & (clusters != ""))
         if not here.any():
             known = (*np.unique(clusters[clusters != ""]).tolist(), *plant.names)
