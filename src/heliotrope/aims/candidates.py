@@ -125,6 +125,12 @@ def surface_in(scene: Scene) -> Plate | Cylinder:
     return surface
 
 
+def turns(count: int) -> FloatArray:
+    """Return numbers from 0 to 1 that are evenly spread and differ between neighbours, (count,)."""
+    # The fractional parts of the multiples of the golden ratio.
+    return as_float((np.arange(count) * 0.6180339887498949) % 1.0)
+
+
 def middles(scene: Scene) -> FloatArray:
     """Return the points at half height that face each mirror, ENU m, (H, 3)."""
     return _across(scene, np.zeros((len(scene.mirrors), 1)))[:, 0]
