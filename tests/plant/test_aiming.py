@@ -415,6 +415,10 @@ def test_without_answers_the_last_good_aims_stay_and_then_the_safe_spread(
         assert operations.aims().source == "last good aims"
         (alarm,) = [a for a in operations.logbook.alarms() if a.active and a.condition == "aims"]
         assert "has ended" in alarm.text
+        await operations._aiming._failed("another cause")
+        (alarm,) = [a for a in operations.logbook.alarms() if a.active and a.condition == "aims"]
+        assert "another cause" in alarm.text
+        assert alarm.count == 1
         for name, aim in before.items():
             np.testing.assert_array_equal(operations.automatic.aims[name], aim)
         assert await greatest(made, 170.0, 6.0) <= LIMIT

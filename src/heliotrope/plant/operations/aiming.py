@@ -462,8 +462,7 @@ class Aiming:
 
         An operator who has taken the command authority while they were computed keeps the field.
         """
-        if not self._problem:
-            self._log.take_alarm(alarms.AIMS.raised(problem=problem))
+        self._log.take_alarm(alarms.AIMS.raised(problem=problem))
         self._problem = problem
         late = self._plant.now() - self._good_at
         if late < SAFE * self._settings.deadline:
