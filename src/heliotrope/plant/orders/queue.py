@@ -67,7 +67,7 @@ class _Under:
     given: int = 0
     token: int = 0
     again: Callable[[tuple[str, ...]], None] | None = None
-    acknowledged: set[str] = field(default_factory=set)
+    acknowledged: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -576,7 +576,7 @@ class PlantOrders(Part):
             self._again.append((under, early))
             part = tuple(name for name in part if name not in early)
         if progress.stage is Stage.ACKNOWLEDGED:
-            under.acknowledged.update(part)
+            under.acknowledged.extend(part)
         under.ticket.advance(part, progress.stage, progress.text)
         return under.ticket, part
 
@@ -604,9 +604,9 @@ class PlantOrders(Part):
         del now
         if not status.commands_listed:
             return
-        for identity in self._under.keys() - set(status.commands):
-            under = self._under[identity]
-            if under.cluster == cluster:
+        listed = set(status.commands)
+        for identity, under in self._under.items():
+            if under.cluster == cluster and identity not in listed:
                 under.ticket.advance(under.acknowledged, Stage.FAILED, _LOST)
 
     def on_beat(self, now: float) -> None:
