@@ -615,9 +615,9 @@ class Aiming:
         await sleep_until(self._plant.clock, self._plant.now() + SETTLED)
         refused = {**ticket.refusals, **ticket.blocked}
         self._block(refused)
-        for name in points.keys() - refused.keys():
-            self._automatic.aims[name] = self._plant.aims[place(name)].copy()
-        self._note(tuple(points.keys() - refused.keys()))
+        moved = tuple(name for name in points if name not in refused)
+        self._automatic.aims.update({name: self._plant.aims[place(name)].copy() for name in moved})
+        self._note(moved)
         return not refused
 
     async def _rest(self, rows: npt.NDArray[np.intp]) -> None:
