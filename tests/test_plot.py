@@ -271,8 +271,14 @@ def test_a_mechanism_has_a_slider_of_time() -> None:
         (lambda ax: plot.efficiency_map(light(), "glare", ax=ax), "efficiency 'glare'"),
         (lambda ax: plot.flux_3d(light(), "glare", ax=ax), "efficiency 'glare'"),
         (
-            lambda ax: plot.receiver_map(replace(light().maps[0], up=np.zeros(1)), ax=ax),
-            "a mesh cannot be unrolled",
+            lambda ax: plot.receiver_map(replace(light().maps[0], flux=np.zeros((1, 9))), ax=ax),
+            "only a map with 2 or more rows and columns",
+        ),
+        (
+            lambda ax: plot.aim_figure(
+                ht.aim(ht.example_plant(), sun=(0.1, 0.6, 0.8), limit=8e4, cells=(6, 1))
+            ),
+            "only a map with 2 or more rows and columns",
         ),
         (lambda ax: plot.field_map(np.zeros((3, 3)), [1.0], ax=ax), r"values: shape \(1,\)"),
         (lambda ax: plot.year_map([0.0], [0.0], [1.0], ax=ax), r"rms: shape \(1,\)"),

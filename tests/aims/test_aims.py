@@ -454,6 +454,23 @@ def test_a_plant_is_aimed_and_what_it_cannot_do_is_refused(tmp_path: Any) -> Non
         aim_scene(replace(field(5), surfaces=two), Demand(FluxLimit(1e6)))
 
 
+def test_heliostats_without_a_cluster_err_like_those_of_one_cluster() -> None:
+    plant, sun = ht.example_plant(), (0.1, 0.6, 0.8)
+    azel = plant.groups["azel"]
+    none, one = (
+        ht.aim(
+            replace(plant, groups={"azel": replace(azel, cluster=cluster)}),
+            sun=sun,
+            limit=6e4,
+            without="P1A",
+        )
+        for cluster in ((), ("pod",) * len(azel))
+    )
+    assert none.scene.risk.own.max() > 1e3
+    np.testing.assert_allclose(none.quantile, one.quantile)
+    assert none.lost_mirrors.sum() == 1
+
+
 def test_where_errors_take_most_of_the_limit_the_rest_is_used(scene: Scene, peak: float) -> None:
     own = np.tile(9e-6 * np.eye(2), (300, 1, 1))
     given = replace(scene, mirrors=replace(scene.mirrors, pointing=own))

@@ -134,6 +134,20 @@ def test_a_limit_below_every_beam_is_refused_unless_beams_that_stay_exceed_it() 
     assert not np.isfinite(aims).any()
 
 
+def test_the_limit_that_a_refusal_advises_holds_with_its_margin() -> None:
+    def refused(limit: float) -> str:
+        now = given(1.0, NONE)
+        demand = replace(now.demand, limit=FluxLimit(limit, 0.05))
+        try:
+            return "" if next_round(replace(now, demand=demand)).moves else "no move"
+        except InputError as error:
+            return str(error)
+
+    text = refused(1e-6 * PEAK)
+    assert "kW/m², multiply" not in text, "the limit is a number"
+    assert not refused(1e3 * float(text.split("raise the limit there to ")[1].split()[0]))
+
+
 def test_a_lost_cluster_makes_room_for_others_and_the_safe_spread_holds() -> None:
     limit = 0.6 * PEAK
     aims = followed(NONE, next_round(given(limit, NONE)), 1.01 * limit)

@@ -4,13 +4,14 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from heliotrope.aims.heating import Heating
-from heliotrope.aims.rounds import Heat, forget
+from heliotrope.aims.rounds import Heat, Move, forget
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.aim_settings import AimSettings
 from heliotrope.field.flux_limit import FluxLimit
@@ -247,14 +248,19 @@ def test_a_limit_that_no_aims_hold_later_leaves_the_last_good_aims(
     played(scene)
 
 
+@pytest.mark.parametrize("blocked", [0, 1])
 def test_beams_that_a_program_finds_leave_where_no_aims_ever_hold_the_limit(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, blocked: int
 ) -> None:
-    """As after a restart with a wrong limit in the plant file."""
+    """As after a restart with a wrong limit in the plant file; some may not go to standby."""
 
     async def scene(made: LivePlant) -> None:
         await up(made)
         part = made.operations._aiming
+        kept = sorted(made.operations.automatic.aims)[:blocked]
+        monkeypatch.setattr(
+            made.plant.guards.identities, "blocked", lambda name: "a test" if name in kept else None
+        )
         monkeypatch.setattr(aiming.Aiming, "_allowed", lambda self, limit, scene: FluxLimit(100.0))
         part._answer, part._source = None, ""
         await asyncio.sleep(60.0)
@@ -322,6 +328,41 @@ def test_while_an_operator_commands_the_flux_is_watched_and_nothing_moves() -> N
     played(scene)
 
 
+def test_a_late_failure_leaves_the_field_to_the_operator_who_has_just_taken_it() -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        part, before = made.operations._aiming, made.plant.aims.copy()
+        tracks = made.plant.field.among((states.TRACKING,), made.plant.now())
+        made.operations.automatic.give_way()
+        made.plant.take_authority(Person("Olga", Role.OPERATOR))
+        part._answer, part._good_at = None, -np.inf
+        await part._failed("a test")
+        assert (made.plant.field.among((states.TRACKING,), made.plant.now()) == tracks).all()
+        np.testing.assert_array_equal(made.plant.aims, before)
+        assert made.operations.aims().problem == "a test"
+
+    played(scene)
+
+
+def test_a_beam_is_not_moved_in_a_visit_that_began_after_the_aims_were_chosen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        part, automatic = made.operations._aiming, made.operations.automatic
+        first, second = sorted(automatic.aims)[:2]
+        visiting = property(lambda self: frozenset({first}))
+        for name, moves in ((first, False), (second, True)):
+            row = made.plant.field.place(name)
+            with monkeypatch.context() as patch:
+                patch.setattr(type(automatic), "visiting", visiting)
+                moved = automatic.aims[name] + (0.0, 0.0, 0.2)
+                await part._go((Move(np.array([row]), moved[None]),))
+            assert np.allclose(made.plant.aims[row], moved) == moves
+
+    played(scene)
+
+
 def test_an_aim_is_refused_in_one_line_that_says_what_to_do() -> None:
     async def scene(made: LivePlant) -> None:
         first, second = made.names[:2]
@@ -374,6 +415,10 @@ def test_without_answers_the_last_good_aims_stay_and_then_the_safe_spread(
         assert operations.aims().source == "last good aims"
         (alarm,) = [a for a in operations.logbook.alarms() if a.active and a.condition == "aims"]
         assert "has ended" in alarm.text
+        await operations._aiming._failed("another cause")
+        (alarm,) = [a for a in operations.logbook.alarms() if a.active and a.condition == "aims"]
+        assert "another cause" in alarm.text
+        assert alarm.count == 1
         for name, aim in before.items():
             np.testing.assert_array_equal(operations.automatic.aims[name], aim)
         assert await greatest(made, 170.0, 6.0) <= LIMIT
@@ -540,14 +585,23 @@ def test_before_the_night_the_field_leaves_along_the_ramp(
     played(scene, sensors=(DNI_READING,), ramp=ramp / every)
 
 
-@pytest.mark.parametrize(("lowest", "before"), [(0.2, np.inf), (0.3, 40.0), (0.4, np.inf)])
-def test_the_ramp_ends_two_rounds_before_the_sun_is_too_low(lowest: float, before: float) -> None:
+@pytest.mark.parametrize(
+    ("lowest", "seconds", "before"),
+    [(0.2, 60.0, np.inf), (0.3, 60.0, 40.0), (0.4, 60.0, np.inf), (0.3, 1e12, 40.0)],
+)
+def test_the_ramp_ends_two_rounds_before_the_sun_is_too_low(
+    monkeypatch: pytest.MonkeyPatch, lowest: float, seconds: float, before: float
+) -> None:
     # The sine of the sun's elevation falls from 0.35 by 0.05 in 70 s.
-    limit, every = FluxLimit(LIMIT), 15.0
-    settings = AimSettings("limit", limit, ramp=LIMIT / 60.0, every=every)
-    heights = SimpleNamespace(sun_vector=lambda ahead: [0.0, 0.0, 0.35 - 0.05 * ahead / 70.0])
+    monkeypatch.setattr(
+        aiming, "vector", lambda utc, _: np.outer(0.35 - 0.05 * utc / 70.0, (0.0, 0.0, 1.0))
+    )
+    settings = AimSettings("limit", FluxLimit(LIMIT), ramp=LIMIT / seconds, every=15.0)
+    start = SimpleNamespace(utc=lambda: datetime.fromtimestamp(0.0, UTC))
     part = SimpleNamespace(
-        _settings=settings, _automatic=SimpleNamespace(lowest=np.arcsin(lowest)), _plant=heights
+        _settings=settings,
+        _automatic=SimpleNamespace(lowest=np.arcsin(lowest)),
+        _plant=SimpleNamespace(clock=start, design=SimpleNamespace(site=None)),
     )
     found = aiming.Aiming._before_night(part)  # type: ignore[arg-type]
     assert found == pytest.approx(before, abs=aiming.STEP)

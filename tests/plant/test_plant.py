@@ -22,6 +22,7 @@ from heliotrope.links.messages import (
     Ask,
     ClusterStatus,
     Command,
+    Emergency,
     Lease,
     Parameters,
     Progress,
@@ -610,6 +611,29 @@ def test_a_command_ends_that_its_cluster_no_longer_lists(tmp_path: Path) -> None
         assert ticket.refusals == {
             "P1A": "acknowledged, but the report of its end was lost, or the cluster restarted"
         }
+
+    play(tmp_path, scene)
+
+
+def test_a_command_goes_on_whose_first_message_was_lost(tmp_path: Path) -> None:
+    """The cluster lists the message that it got, not the one that was repeated."""
+
+    async def scene(bench: Bench) -> None:
+        await bench.commanded()
+        cluster = bench.clusters["pod-1"]
+        cluster.deaf.update(cluster.names)
+        ticket = bench.plant.stow("engineer", ("P1A",))
+        await bench.wait(1.5)
+        first, again = (sent.identity for sent in cluster.of(Emergency) if sent.name == "STOW")
+        assert first != again
+        await cluster.send(Progress(again, Stage.ACKNOWLEDGED, ("P1A",)))
+        status = ClusterStatus("pod-1", 0, 0.0, "gps", 0.0, 3.0, 0.1, commands_listed=True)
+        await cluster.send(replace(status, commands=(again,)))
+        await bench.wait(1.0)
+        assert ticket.counted() == {"acknowledged": 1}
+        await cluster.send(status)
+        await bench.wait(1.0)
+        assert ticket.counted() == {"failed": 1}
 
     play(tmp_path, scene)
 

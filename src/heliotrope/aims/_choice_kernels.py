@@ -52,14 +52,14 @@ def _worth(i, images, shifts, price, spans, out):
 
 
 @njit(**_SUMS)
-def worths(first, last, mirrors, images, shifts, price, spans, out):
-    """Sum price times flux over all cells, for each candidate of ``mirrors[first:last]``.
+def worths(first, last, images, shifts, price, spans, out):
+    """Sum price times flux over all cells, for each candidate of the mirrors first to last − 1.
 
     ``price`` (columns, rows) in 32 bits; ``spans`` (columns, 2): rows where it is not zero; ``out``
     (H, A).
     """
-    for n in range(first, last):
-        _worth(mirrors[n], images, shifts, price, spans, out[mirrors[n]])
+    for i in range(first, last):
+        _worth(i, images, shifts, price, spans, out[i])
 
 
 @njit(**_INNER_SUMS)
@@ -130,14 +130,13 @@ def _add_priced(i, a, sign, images, shifts, flux, base, steep, price, spans):
 
 @njit(**_SUMS)
 def sweep(order, images, shifts, power, idle, base, steep, choice, flux, price, spans):
-    """Let each mirror in turn take its most valuable candidate; return the number of changes.
+    """Let each mirror in turn take its most valuable candidate.
 
     The price of flux in a cell is ``max(0, base + steep flux)``, W per W/m², as in an augmented
     Lagrangian. ``power`` (H, A) in W; ``idle``: the value of sending no light, W. ``choice`` (H,),
     ``flux``, ``price`` and ``spans`` are kept up to date.
     """
     worth = np.empty(power.shape[1])
-    changed = 0
     for i in order:
         before = choice[i]
         if before >= 0:
@@ -151,8 +150,6 @@ def sweep(order, images, shifts, power, idle, base, steep, choice, flux, price, 
         choice[i] = best
         if best >= 0:
             _add_priced(i, best, 1.0, images, shifts, flux, base, steep, price, spans)
-        changed += best != before
-    return changed
 
 
 @njit(**_INNER_SUMS)
@@ -194,13 +191,12 @@ def _free(i, a, images, shifts, over):
 
 @njit(**_SUMS)
 def settle(order, images, shifts, power, idle, choice, over, fine, fill):
-    """Let each mirror in turn take the best candidate after penalties; return how many changed.
+    """Let each mirror in turn take the best candidate after penalties.
 
     ``over``: flux minus the cap, W/m², (columns, rows), kept up to date. ``fine``: penalty on the
     excess that a candidate adds, W per W/m². ``idle``: the value of sending no light, W. Without
     ``fill`` only mirrors that add to an excess change.
     """
-    changed = 0
     net = np.empty(power.shape[1])
     for i in order:
         before = choice[i]
@@ -232,8 +228,6 @@ def settle(order, images, shifts, power, idle, choice, over, fine, fill):
         choice[i] = best
         if best >= 0:
             _add(i, best, 1.0, images, shifts, over)
-        changed += best != before
-    return changed
 
 
 @njit(**_SUMS)

@@ -70,19 +70,18 @@ class Candidates:
         middle = self.shifts.shape[1] * (self.images.looks // 2) + self.shifts.shape[1] // 2
         return float(self.power[:, middle].sum())
 
-    def worth(self, price: FloatArray, mirrors: IntArray | None = None) -> FloatArray:
+    def worth(self, price: FloatArray) -> FloatArray:
         """Return the sum over cells of price times flux, for each candidate, (H, K · S).
 
         The prices are (columns, rows).
         """
-        chosen = np.arange(len(self.weight)) if mirrors is None else mirrors
         out = np.zeros(self.aims.shape[:2])
         price32, spans = price.astype(np.float32), spans_of(price)
 
         def block(first: int, last: int) -> None:
-            kernels.worths(first, last, chosen, self.table, self.shifts, price32, spans, out)
+            kernels.worths(first, last, self.table, self.shifts, price32, spans, out)
 
-        run_blocks(block, len(chosen))
+        run_blocks(block, len(self.weight))
         return out
 
     def flux(self, choice: IntArray, mirrors: IntArray | None = None) -> FloatArray:
@@ -124,6 +123,12 @@ def surface_in(scene: Scene) -> Plate | Cylinder:
             "use one of these"
         )
     return surface
+
+
+def turns(count: int) -> FloatArray:
+    """Return numbers from 0 to 1 that are evenly spread and differ between neighbours, (count,)."""
+    # The fractional parts of the multiples of the golden ratio.
+    return as_float((np.arange(count) * 0.6180339887498949) % 1.0)
 
 
 def middles(scene: Scene) -> FloatArray:

@@ -221,7 +221,7 @@ def plan_aims(
     give
         Fraction of the power that may be sacrificed for the wanted map, 0 to 0.5.
     without
-        Names of lost heliostats and clusters, which send no light.
+        Lost heliostats and clusters, one name or several; they send no light.
     start
         A plan of the same plant and receiver for another sun position, irradiance or limit, or with
         other heliostats lost, from which the search begins.
@@ -262,15 +262,16 @@ def plan_aims(
         FluxLimit.of(limit),
         probability,
         shared or SharedErrors(),
-        np.unique(_clusters(plant), return_inverse=True)[1],
+        np.unique(plant.cluster, return_inverse=True)[1],
         np.array([0.0, np.cos(latitude), np.sin(latitude)]),
         keep,
         None if wanted is None else FluxLimit.of(wanted),
         give,
     )
-    options = {"sun": optics.shape, "air": optics.air, "gaussians": optics.gaussians}
-    begin = None if start is None else start.scene
-    aimed = aim_scene(scene, demand, strategy=strategy, start=begin, progress=progress, **options)
+    aimed = aim_scene(
+        scene, demand, strategy=strategy, start=None if start is None else start.scene,
+        progress=progress, sun=optics.shape, air=optics.air, gaussians=optics.gaussians,
+    )  # fmt: skip
     result = result_of(plant, aimed.engine.scene, aimed.engine)
     lit = aimed.field.power.max(axis=1) > 0.0
     defocused, unlimited = aimed.defocused & ~off & lit, aimed.field.middle_power
@@ -278,16 +279,11 @@ def plan_aims(
     return AimPlan(strategy, result, defocused, beyond, others, lost, unlimited, aimed)
 
 
-def _clusters(plant: Plant) -> list[str]:
-    """Return the cluster of each heliostat; "" without one."""
-    return [name for group in plant.groups.values() for name in group.cluster]
-
-
 def _named(plant: Plant, names: Iterable[str]) -> npt.NDArray[np.bool_]:
     """Return a mask of the heliostats that are named, or whose cluster is, (N,)."""
-    mask, clusters = np.zeros(len(plant), dtype=np.bool_), np.array(_clusters(plant))
+    mask, clusters = np.zeros(len(plant), dtype=np.bool_), np.array(plant.cluster)
     heliostats = np.array(plant.names)
-    for name in names:
+    for name in (names,) if isinstance(names, str) else names:
         here = (heliostats == name) | ((clusters == name) & (clusters != ""))
         if not here.any():
             known = (*np.unique(clusters[clusters != ""]).tolist(), *plant.names)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from heliotrope.aims.candidates import turns
 from heliotrope.aims.scene_aims import SceneAims
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
@@ -38,9 +39,8 @@ def ramp_up(aims: SceneAims, rate: float, step: float = 60.0) -> FloatArray:
     images = aims.engine.images(aims.aims[:, None, :], np.zeros(count, dtype=np.int64))
     joins = np.full(count, np.nan)
     joining = ~aims.defocused & (aims.engine.leaving > 0.0)
-    turn = (np.arange(count) * 0.6180339887498949) % 1.0
     # If neighbours joined one after the other, they would fill the same cells first.
-    waiting = [int(row) for row in np.argsort(turn, kind="stable") if joining[row]]
+    waiting = [int(row) for row in np.argsort(turns(count), kind="stable") if joining[row]]
     peak = float(aims.engine.maps[0].max())
     if peak > MOST * rate * step:
         raise InputError(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.aims.candidates import middles, surface_in
+from heliotrope.aims.candidates import middles, surface_in, turns
 from heliotrope.aims.scene_aims import Demand, SceneAims, aim_scene, risk_of
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
@@ -38,9 +38,6 @@ LOOKED = 400
 THINNER = 0.85
 #: Age at which images are computed anew, s.
 FRESH = 600.0
-
-#: The fractional parts of the multiples of the golden ratio are evenly spread.
-GOLDEN = 0.6180339887498949
 #: Fraction of the mirrors that rest before the mirrors that must also rest are computed anew.
 SHED = 0.01
 
@@ -220,10 +217,9 @@ def next_round(now: Round, **light: Any) -> Answer:
     rows, columns = surface_in(now.scene).shape
     limit = now.demand.limit.on(rows, columns)
     fixed, room = _room(now, limit, light)
-    demand = replace(now.demand, limit=type(now.demand.limit)(room))
     best, target_aims, problem = None, now.aims, ""
     try:
-        best = _best(now, demand, light)
+        best = _best(now, room, light)
         target_aims = np.where((now.free & ~best.defocused)[:, None], best.aims, np.nan)
     except InputError:
         if not (problem := _kept(now, fixed, limit)):
@@ -350,7 +346,7 @@ def steps(
     else:
         # Mirrors join first; others move meanwhile only if the ramp is not what mirrors wait for.
         # Neighbours one after the other would heat the same cells first.
-        todo = todo[np.argsort((todo * GOLDEN) % 1.0, kind="stable")]
+        todo = todo[np.argsort(turns(len(have))[todo], kind="stable")]
         moves += walk.through(todo[~have[todo]], target_aims)
         waiting = walk.waiting(todo[~have[todo]], as_float(np.maximum(limit_cap, 0.0).T))
         if not waiting:
@@ -367,21 +363,17 @@ class _Path:
     """Images of mirrors on their paths from present to target aims."""
 
     def __init__(self, now: Round, target_aims: FloatArray, light: dict[str, Any]) -> None:
-        aimed, goes = _aimed(now.aims), _aimed(target_aims)
-        start = np.where(aimed[:, None], now.aims, target_aims)
-        end = np.where(goes[:, None], target_aims, start)
-        some = aimed | goes
-        middle = middles(now.scene)
-        start = np.where(some[:, None], start, middle)
-        end = np.where(some[:, None], end, middle)
-        engine = FieldFlux(_posed(now.scene, np.where(some[:, None], start, np.nan)), **light)
+        self.aimed, self.goes = _aimed(now.aims), _aimed(target_aims)
+        start = np.where(self.aimed[:, None], now.aims, target_aims)
+        engine = FieldFlux(_posed(now.scene, start), **light)
+        start = np.where(_aimed(start)[:, None], start, middles(now.scene))
+        end = np.where(self.goes[:, None], target_aims, start)
         width = engine.scene.mirrors.slant * 5e-3
         far = np.linalg.norm(end - start, axis=1) / np.maximum(width, 1e-6)
         count = int(np.clip(np.ceil(far.max(initial=0.0)) + 1, 2, PLACES))
         at = np.linspace(0.0, 1.0, count)[:, None]
         looks = start[:, None] + at * (end - start)[:, None]
-        self.images: Images = engine.images(as_float(looks), np.zeros(len(some), dtype=np.int64))
-        self.aimed, self.goes = aimed, goes
+        self.images: Images = engine.images(as_float(looks), np.zeros(len(start), dtype=np.int64))
 
     def flux(self, which: Mask) -> FloatArray:
         """Return the flux of mirrors at their present aims, (columns, rows)."""
@@ -490,8 +482,8 @@ class _Walk:
         return [_rest(np.array(resting, dtype=np.intp))] if resting else []
 
 
-def _best(now: Round, demand: Demand, light: dict[str, Any]) -> SceneAims:
-    """Return the aims of maximum power.
+def _best(now: Round, room: FloatArray, light: dict[str, Any]) -> SceneAims:
+    """Return the aims of maximum power in the room that beams which stay leave.
 
     The search starts from this process's earlier aims if they fit the scene.
     """
@@ -504,7 +496,7 @@ def _best(now: Round, demand: Demand, light: dict[str, Any]) -> SceneAims:
         # Images of mirrors that were dark are empty.
         if same and 0.0 <= now.at - before_at < FRESH and not (now.free & ~were_free).any():
             at, start = before_at, before
-    computed = aim_scene(scene, demand, start=start, **light)
+    computed = aim_scene(scene, now.demand, room=room, start=start, **light)
     _last[:] = [(at, now.free, computed)]
     return computed
 
@@ -522,8 +514,7 @@ def _alike(scene: Scene, other: Scene) -> bool:
 
 def _safe(now: Round, room: FloatArray, light: dict[str, Any]) -> FloatArray:
     """Return the plant file's aims for as many free mirrors as the limit allows, (H, 3)."""
-    turn = (np.arange(len(now.free)) * GOLDEN) % 1.0
-    share = 1.0
+    turn, share = turns(len(now.free)), 1.0
     while share > 0.5 / len(now.free):
         aims = np.where((now.free & (turn < share))[:, None], now.spread, np.nan)
         engine = FieldFlux(_posed(now.scene, aims), **light)

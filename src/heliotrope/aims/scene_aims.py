@@ -159,6 +159,7 @@ def aim_scene(
     demand: Demand,
     *,
     strategy: Strategy = "optimal",
+    room: FloatArray | None = None,
     start: SceneAims | None = None,
     progress: Step | None = None,
     **light: Any,
@@ -174,6 +175,8 @@ def aim_scene(
     strategy
         One of `heliotrope.aims.STRATEGIES`. Only "optimal" keeps the limit; "gradient" may exceed
         it, and the others ignore it.
+    room
+        What other beams leave of the limit, W/m², (rows, columns); None: all of it.
     start
         Aims of the same mirrors and receiver at another sun, irradiance or limit, or with other
         mirrors in ``dark``: their images are used again, which takes a fraction of the time. If a
@@ -190,7 +193,7 @@ def aim_scene(
         even one beam with its errors, or no aims respect the limit with every mirror kept.
     """
     rows, columns = surface_in(scene).shape
-    limit = demand.limit.on(rows, columns)
+    limit = demand.limit.on(rows, columns) if room is None else room
     if start is None or not _usable(start, scene):
         start = None
         base = FieldFlux(_posed(scene, middles(scene), None), **light)
@@ -421,12 +424,15 @@ def _refuse(scene: Scene, trial: SceneAims, demand: Demand, what: str, advice: s
     """Raise InputError: where the limit is exceeded most, by how much, and what would hold."""
     over = trial.quantile / trial.limit
     cell = tuple(int(n) for n in np.unravel_index(over.argmax(), over.shape))
-    enough = _raised(trial, demand).limit[cell] / (1.0 - demand.limit.margin)
+    limit = demand.limit.on(*over.shape)[cell]
+    others = limit - trial.limit[cell]
+    flux = trial.quantile[cell] + others
+    enough = (_raised(trial, demand).limit[cell] + others) / (1.0 - demand.limit.margin)
     hint = f"; {demand.limit.unit_hint}" if demand.limit.unit_hint else ""
     raise InputError(
         f"receiver {surface_in(scene).name}: {what}; {_place(scene, cell)} gets "
-        f"{1e-3 * trial.quantile[cell]:.4g} kW/m², of which {1e-3 * trial.risk.above[cell]:.4g} "
-        f"are due to errors, {_percent(trial.excess)} above its {1e-3 * trial.limit[cell]:.4g}; "
+        f"{1e-3 * flux:.4g} kW/m², of which {1e-3 * trial.risk.above[cell]:.4g} "
+        f"are due to errors, {_percent(flux / limit - 1.0)} above its {1e-3 * limit:.4g}; "
         f"raise the limit there to {1e-3 * enough:.4g} kW/m²{advice}{hint}"
     )
 

@@ -41,8 +41,8 @@ class AimSettings:
     every
         Time between two computations, s.
     deadline
-        Age of the last good aims at which an alarm is raised, s; after five times this age the
-        field goes to the safe spread.
+        Time within which aims must be computed, s; when the last good aims are five times as old,
+        the field goes to the safe spread.
 
     Raises
     ------

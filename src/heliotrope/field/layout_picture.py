@@ -38,9 +38,8 @@ def picture(plant: Plant) -> "Figure":
 
 def _numbers(plant: Plant) -> np.ndarray:
     """Return the cluster number of each heliostat."""
-    names = [c for g in plant.groups.values() for c in (g.cluster or ("",) * len(g))]
-    order = {name: k for k, name in enumerate(dict.fromkeys(names))}
-    return np.array([order[name] for name in names])
+    order = {name: k for k, name in enumerate(dict.fromkeys(plant.cluster))}
+    return np.array([order[name] for name in plant.cluster])
 
 
 def _whole(ax: "Axes", plant: Plant) -> None:

@@ -202,6 +202,11 @@ class Plant(Value, Framed):
         return tuple(name for group in self.groups.values() for name in group.names)
 
     @cached_property
+    def cluster(self) -> tuple[str, ...]:
+        """Cluster of each heliostat, group after group; "" without one."""
+        return tuple(c for g in self.groups.values() for c in g.cluster or ("",) * len(g))
+
+    @cached_property
     def _place(self) -> dict[str, tuple[str, int]]:
         return {
             name: (group, i)

@@ -206,7 +206,7 @@ class _MemoryCarrier:
         self._check()
 
     async def write(self, envelope: bytes, lifetime: float | None) -> None:
-        """Put an envelope on the line, which ignores lifetime and confirmation."""
+        """Put an envelope on the line, which ignores the lifetime."""
         del lifetime
         self._check()
         self._out.put(envelope, self._line.faults)

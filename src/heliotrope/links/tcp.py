@@ -265,7 +265,7 @@ class _TcpCarrier:
         await self._connected().ready()
 
     async def write(self, envelope: bytes, lifetime: float | None) -> None:
-        """Write an envelope; TCP ignores lifetime and confirmation."""
+        """Write an envelope; TCP ignores the lifetime."""
         del lifetime
         self._connected().write(envelope)
 

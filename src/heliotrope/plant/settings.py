@@ -111,7 +111,7 @@ class PlantSettings:
         """
         rate = self.join_rate
         if rate is None:
-            together = self.stow_rate or float(sum(len(g.names) for g in design.groups.values()))
+            together = self.stow_rate or float(len(design))
             rate = together if design.aims.ramp > 0.0 else JOIN_RATE
         return rate, max(1, round(rate)) if self.join_burst is None else self.join_burst
 
@@ -135,12 +135,8 @@ def clusters_of(design: Plant) -> dict[str, tuple[str, ...]]:
         If a heliostat has no cluster.
     """
     found: dict[str, list[str]] = {}
-    for group in design.groups.values():
-        for i, name in enumerate(group.names):
-            cluster = group.cluster[i] if group.cluster else ""
-            if not cluster:
-                raise InputError(
-                    f"heliostat {name} belongs to no cluster; name one in the plant file"
-                )
-            found.setdefault(cluster, []).append(name)
+    for name, cluster in zip(design.names, design.cluster, strict=True):
+        if not cluster:
+            raise InputError(f"heliostat {name} belongs to no cluster; name one in the plant file")
+        found.setdefault(cluster, []).append(name)
     return {cluster: tuple(names) for cluster, names in found.items()}

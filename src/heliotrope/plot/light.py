@@ -48,16 +48,17 @@ def receiver_map(
     Raises
     ------
     InputError
-        If the receiver is a mesh, and its surface was not passed.
+        If there are fewer than two rows or columns of cells, as in the map of a mesh whose surface
+        was not passed.
     """
     if isinstance(surface, Mesh | Cavity):
         ax = _axes(ax)
         mesh = ax.add_collection(_front_view(surface, view))
         ax.autoscale_view()
-    elif len(view.up) < 2:
+    elif min(view.flux.shape) < 2:
         raise InputError(
-            f"receiver {view.receiver}: a mesh cannot be unrolled; pass its surface, or draw it "
-            "with flux_3d"
+            f"receiver {view.receiver}: only a map with 2 or more rows and columns of cells can be "
+            "drawn; pass the surface of a mesh, or draw it with flux_3d"
         )
     else:
         ax = _axes(ax)

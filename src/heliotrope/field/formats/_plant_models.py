@@ -582,8 +582,8 @@ class AimsTable(StrictTable):
     )
     deadline_s: Number = Field(
         AimSettings.deadline,
-        description="Age of the last good aims at which an alarm is raised; at five times this "
-        "age the field goes to the safe spread. From twice every_s to 3600.",
+        description="Time within which aims must be computed; when the last good aims are five "
+        "times as old, the field goes to the safe spread. From twice every_s to 3600.",
     )
 
 

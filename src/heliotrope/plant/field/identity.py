@@ -136,7 +136,7 @@ class Identities(Part):
         new = tuple(name for name, text in reasons.items() if self.mismatched.get(name) != text)
         for name in new:
             self._tell(alarms.IDENTITY.raised(name, problem=reasons[name]))
-        for name in self.mismatched.keys() - reasons.keys():
+        for name in [known for known in self.mismatched if known not in reasons]:
             self._tell(alarms.IDENTITY.ended(name))
         self.mismatched = reasons
         if new:

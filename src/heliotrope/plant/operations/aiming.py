@@ -50,7 +50,7 @@ from heliotrope.plant.orders.authority import RefusedError
 from heliotrope.plant.workers import Worker
 from heliotrope.safety import alarms
 from heliotrope.store.records import Records, StoreError
-from heliotrope.sun import clear_sky
+from heliotrope.sun import clear_sky, vector
 
 #: Time for which a beam without reports may still be where it was last reported, s.
 HOLD = 120.0
@@ -67,8 +67,8 @@ BLOCKED = 300.0
 BRIGHT = 1.15
 #: The sun shines above this fraction of the irradiance under a usual clear sky.
 SUNNY = 0.5
-#: Step of the search for the time at which the field stows, s.
-STEP = 10.0
+#: Step of the search for the time at which the field stows, and how far ahead it looks at most, s.
+STEP, DAY = 10.0, 86_400.0
 #: Time between two rounds while heliostats wait for the ramp, s.
 SOON = 3.0
 #: Time for which a limit stays lowered after a measured flux was above it, s.
@@ -441,11 +441,12 @@ class Aiming:
         lowest = math.sin(self._automatic.lowest)
         longest = float(np.max(self._settings.limit.flux)) / self._settings.ramp
         longest += 2.0 * self._settings.every  # a round takes effect in the next
-        ahead = np.arange(0.0, longest + STEP, STEP)
-        low = [self._plant.sun_vector(float(time))[2] < lowest for time in ahead]
-        if low[0] or not any(low):
+        ahead = np.arange(0.0, min(longest, DAY) + STEP, STEP)
+        utc, site = self._plant.clock.utc().timestamp(), self._plant.design.site
+        low = vector(utc + ahead, site)[:, 2] < lowest
+        if low[0] or not low.any():
             return math.inf
-        return max(float(ahead[low.index(True)]) - 2.0 * self._settings.every, 0.0)
+        return max(float(ahead[low.argmax()]) - 2.0 * self._settings.every, 0.0)
 
     def _clear_sky(self) -> float:
         """Return the irradiance under a usual clear sky, W/m²."""
@@ -457,14 +458,16 @@ class Aiming:
         return self._plant.sentinel.table.shown(now).get(DNI_READING, math.nan)
 
     async def _failed(self, problem: str) -> None:
-        """Keep the last good aims; once these are too old, go to the safe spread."""
-        if not self._problem:
-            self._log.take_alarm(alarms.AIMS.raised(problem=problem))
+        """Keep the last good aims; once these are too old, go to the safe spread.
+
+        An operator who has taken the command authority while they were computed keeps the field.
+        """
+        self._log.take_alarm(alarms.AIMS.raised(problem=problem))
         self._problem = problem
         late = self._plant.now() - self._good_at
         if late < SAFE * self._settings.deadline:
             self._source = "" if self._answer is None else "last good aims"
-        elif self._source != "safe spread":
+        elif self._source != "safe spread" and not self._automatic.idle:
             self._source = "safe spread"
             nowhere = np.full((len(self._plant.field), 3), np.nan)
             await self._to_safe(nowhere if self._answer is None else self._answer.safe)
@@ -478,10 +481,10 @@ class Aiming:
         apart = ~(np.linalg.norm(self._plant.aims - safe, axis=1) < 0.05)
         rows = np.flatnonzero(on & apart)
         self._automatic.aims.clear()
-        if await self._rest(rows):
-            names = self._plant.field.names
-            some = np.flatnonzero(np.isfinite(safe).all(axis=1))
-            self._automatic.aims.update({names[row]: safe[row] for row in some})
+        await self._rest(rows)
+        names = self._plant.field.names
+        some = np.flatnonzero(np.isfinite(safe).all(axis=1))
+        self._automatic.aims.update({names[row]: safe[row] for row in some})
 
     # -- the field -------------------------------------------------------------------------
 
@@ -575,19 +578,22 @@ class Aiming:
     # -- moves -----------------------------------------------------------------------------
 
     async def _go(self, moves: tuple[Move, ...]) -> None:
-        """Make the moves one after the other; after a failed move, wait for the next round."""
+        """Make the moves one after the other.
+
+        Wait for the next round after a failed move, and where a beam may no longer be moved, as in
+        a visit that has begun since.
+        """
         until = self._plant.now() + 2.0 * self._settings.every
         names, aims = self._plant.field.names, self._automatic.aims
         for move in moves:
-            if self._plant.now() > until or self._automatic.idle:
+            now = self._plant.now()
+            on, free = (mask[move.rows] for mask in (self._on(now), self._movers(now)))
+            if now > until or self._automatic.idle or (on & ~free).any():
                 return
-            on = self._on(self._plant.now())[move.rows]
-            free = self._movers(self._plant.now())[move.rows]
             rests = np.asarray(~np.isfinite(move.aims).all(axis=1))
             for row in move.rows[rests]:
                 aims.pop(names[row], None)
-            if not await self._rest(move.rows[rests & on & free]):
-                return
+            await self._rest(move.rows[rests & on])
             pairs = zip(move.rows, move.aims, on, rests, strict=True)
             goes = [(names[row], aim, shines) for row, aim, shines, rest in pairs if not rest]
             aims.update({name: aim for name, aim, shines in goes if not shines})
@@ -609,31 +615,30 @@ class Aiming:
         await sleep_until(self._plant.clock, self._plant.now() + SETTLED)
         refused = {**ticket.refusals, **ticket.blocked}
         self._block(refused)
-        for name in points.keys() - refused.keys():
-            self._automatic.aims[name] = self._plant.aims[place(name)].copy()
-        self._note(tuple(points.keys() - refused.keys()))
+        moved = tuple(name for name in points if name not in refused)
+        self._automatic.aims.update({name: self._plant.aims[place(name)].copy() for name in moved})
+        self._note(moved)
         return not refused
 
-    async def _rest(self, rows: npt.NDArray[np.intp]) -> bool:
-        """Take beams off the receiver; return whether the order was accepted.
+    async def _rest(self, rows: npt.NDArray[np.intp]) -> None:
+        """Take beams off the receiver.
 
-        They go to standby, or turn away where new motions are refused, as after many failures:
-        a limit must hold then too.
+        They go to standby, or turn away where that is refused, as after many failures: a limit must
+        hold then too.
         """
         names = tuple(self._plant.field.names[row] for row in rows)
         if not names:
-            return True
+            return
         try:
-            try:
-                ticket = self._automatic.rest(names)
-            except RefusedError:
-                ticket = self._automatic.turn_away(names)
-        except HeliotropeError as error:
-            self._block(getattr(error, "refusals", dict.fromkeys(names, str(error))))
-            return False
-        await ticket.end(MOVED)
+            tickets = [self._automatic.rest(names)]
+            refused = tuple(tickets[0].blocked)
+        except RefusedError:
+            tickets, refused = [], names
+        if refused:
+            tickets.append(self._automatic.turn_away(refused))
+        for ticket in tickets:
+            await ticket.end(MOVED)
         self._note(names)
-        return True
 
     def _block(self, refused: dict[str, str]) -> None:
         for name in refused:

@@ -170,7 +170,7 @@ class Service:
         due = sorted(name for name in self._unparked if self.attempts.due(name, now))
         if left := [name for name in due if away[field.place(name)]]:
             self._stow("out of service", left)
-        for name in set(due).difference(left):
+        for name in [each for each in due if each not in left]:
             self.attempts.failed(name, field.of(name, now).condition, now)
 
     def _done(self, name: str) -> None:

@@ -3,7 +3,7 @@
 import struct
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 
@@ -57,7 +57,7 @@ class _Under:
     """One message in transit.
 
     The message was issued with the token ``given`` and sent with the token ``token``; ``again``
-    sends it again.
+    sends it again. ``acknowledged`` are the heliostats that have acknowledged this message.
     """
 
     ticket: Ticket
@@ -67,6 +67,7 @@ class _Under:
     given: int = 0
     token: int = 0
     again: Callable[[tuple[str, ...]], None] | None = None
+    acknowledged: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -574,6 +575,8 @@ class PlantOrders(Part):
             early = tuple(name for name in part if name in waiting)
             self._again.append((under, early))
             part = tuple(name for name in part if name not in early)
+        if progress.stage is Stage.ACKNOWLEDGED:
+            under.acknowledged.extend(part)
         under.ticket.advance(part, progress.stage, progress.text)
         return under.ticket, part
 
@@ -601,12 +604,10 @@ class PlantOrders(Part):
         del now
         if not status.commands_listed:
             return
-        for identity in self._under.keys() - set(status.commands):
-            under = self._under[identity]
-            if under.cluster == cluster and not under.ticket.finished:
-                ended = set(under.ticket.waiting(under.heliostats))
-                ended.difference_update(under.ticket.unacknowledged())
-                under.ticket.advance(ended, Stage.FAILED, _LOST)
+        listed = set(status.commands)
+        for identity, under in self._under.items():
+            if under.cluster == cluster and identity not in listed:
+                under.ticket.advance(under.acknowledged, Stage.FAILED, _LOST)
 
     def on_beat(self, now: float) -> None:
         """End commands without a reply in time; record the results of ended tickets."""
