@@ -117,7 +117,8 @@ def optimise(
     """
     rng, everyone = np.random.default_rng(0), np.arange(len(field.weight))
     idle = -1e300 if keep else 0.0
-    reached, least = None, np.inf
+    # Without prices, the bound is the power without a limit.
+    reached, least = None, float(np.maximum(field.power.max(axis=1), idle).sum())
     if start is None:
         prices, choice = np.zeros_like(cap), np.full(len(everyone), -1)
         if len(everyone) > LARGE:
@@ -129,7 +130,7 @@ def optimise(
             choice = bound(field, cap, prices, idle)[1]
     else:
         prices, choice = start.prices.copy(), start.choice.copy()
-        least = bound(field, cap, prices, idle)[0]
+        least = min(least, bound(field, cap, prices, idle)[0])
         if not sweeps or _near(field, cap, choice, least, gap):
             reached = _settled(field, cap, prices, choice, least, idle)
     for k in range(sweeps):
