@@ -261,6 +261,7 @@ def test_with_two_receivers_each_heliostat_counts_for_its_own(aim: Any) -> None:
         (("--limit=none.csv", "--panels=panels.csv"), "none.csv"),
         (("--limit=100", "--without=P6"), "there is no heliostat or cluster 'P6'; did you mean"),
         (("--limit=100", "--wanted=even"), "--wanted must be uniform"),
+        (("--limit=100", "--wanted=none.csv"), "no such file; specify the path of a flux map"),
         (("--limit=100", "--time=now"), "--time or --sun"),
         (("--limit=100", "--receiver=other"), "other"),
     ],
