@@ -428,7 +428,8 @@ def test_a_map_in_kw_gets_a_hint_of_the_unit() -> None:
     assert FluxLimit([[600.0, 700.0]]).unit_hint == hint
     assert FluxLimit([[600.0, 1e4]]).unit_hint == ""
     assert FluxLimit(700.0).unit_hint == ""
-    with pytest.raises(InputError, match=rf"raise the limit there to .* kW/m²; {hint}$"):
+    advice = "raise the limit there to .* kW/m² and elsewhere by the same factor"
+    with pytest.raises(InputError, match=rf"{advice}; {hint}$"):
         ht.aim(ht.example_plant(), sun=[0.1, 0.6, 0.8], limit=[[600.0, 700.0]], cells=(12, 12))
 
 

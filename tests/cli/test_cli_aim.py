@@ -142,12 +142,20 @@ def test_a_uniform_flux_and_a_ramp_are_told(aim: Any) -> None:
     assert len({row["joins_s"] for row in rows}) > 1
 
 
-def test_the_limit_that_a_refusal_advises_holds(aim: Any) -> None:
-    code, _, err = aim("--limit=5")
+@pytest.mark.parametrize("words", [("--limit=5",), ("--limit=30", "--keep-all")])
+def test_the_limit_that_a_refusal_advises_holds(aim: Any, words: tuple[str, ...]) -> None:
+    code, _, err = aim(*words)
     assert code == 2
     advised = err.split("raise the limit there to ")[1].split()[0]
-    code, _, err = aim(f"--limit={advised}")
+    code, _, err = aim(f"--limit={advised}", *words[1:])
     assert code == 0, err
+
+
+def test_the_advised_limit_of_a_map_is_for_all_its_cells(aim: Any) -> None:
+    Path("limit.csv").write_text("30000,25000\n25000,25000\n", encoding="utf-8")
+    code, _, err = aim("--limit=limit.csv", "--keep-all")
+    assert code == 2
+    assert " kW/m² and elsewhere by the same factor, or let heliostats be defocused" in err
 
 
 def test_a_limit_over_temperature_and_velocity_lies_on_the_panels(aim: Any) -> None:
@@ -253,6 +261,7 @@ def test_with_two_receivers_each_heliostat_counts_for_its_own(aim: Any) -> None:
         (("--limit=none.csv", "--panels=panels.csv"), "none.csv"),
         (("--limit=100", "--without=P6"), "there is no heliostat or cluster 'P6'; did you mean"),
         (("--limit=100", "--wanted=even"), "--wanted must be uniform"),
+        (("--limit=100", "--wanted=none.csv"), "no such file; specify the path of a flux map"),
         (("--limit=100", "--time=now"), "--time or --sun"),
         (("--limit=100", "--receiver=other"), "other"),
     ],

@@ -293,8 +293,8 @@ def test_every_number_ends_in_a_value_or_in_one_line(
         (("sun", "--every", "0.1s"), "from 1 s to 1000 h"),
         (("parameters", "psi_t=1e300"), "write NAME=VALUE with a number"),
         (("sun", "--lat", "5"), "No such option: --lat"),
-        (("moon",), "No such command 'moon'.; see heliotrope -h"),
-        (("track",), "Missing argument 'field'.; see heliotrope track -h"),
+        (("moon",), "No such command 'moon'; see heliotrope -h"),
+        (("track",), "Missing argument 'field'; see heliotrope track -h"),
     ],
 )
 def test_the_line_names_option_value_and_limits(

@@ -555,6 +555,27 @@ def test_a_restart_in_full_sun_takes_no_beam_from_a_warm_receiver() -> None:
     played(scene, sensors=(DNI_READING,), ramp=ramp / every)
 
 
+def test_beams_that_a_program_finds_have_their_share_while_they_are_in_visits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A visit returns its beam to its aim on the receiver, whatever other beams aim there then."""
+
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        automatic, aiming = made.operations.automatic, made.operations._aiming
+        row = int(np.flatnonzero(aiming._on(made.plant.now()))[0])
+        aim, name = made.plant.aims[row].copy(), made.plant.field.names[row]
+        # What the program has kept in memory only.
+        automatic.aims.clear()
+        await asyncio.sleep(20.0)
+        monkeypatch.setattr(automatic, "_visiting", lambda: frozenset({name}))
+        away = np.arange(len(made.plant.field)) != row
+        monkeypatch.setattr(aiming, "_on", lambda now: away)
+        np.testing.assert_allclose(aiming._round(made.plant.now()).fixed[row], aim)
+
+    played(scene)
+
+
 def test_before_the_night_the_field_leaves_along_the_ramp(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from heliotrope.cli.field import noon_suns
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.layouts import malan_plant
+from heliotrope.field.layouts import lay_out, malan_plant
 from heliotrope.field.plant import Plant
 from heliotrope.field.points import read_points, write_points
 from heliotrope.geometry import FloatArray
@@ -47,6 +47,15 @@ def test_spread_points_keep_the_limit_and_the_return() -> None:
         along = near[:, None] + random.normal(0.0, 15.0, (len(PLANT), 60))
         points = beams.point(np.maximum(along, 1.0)).reshape(-1, 3)
         assert crossing(beams, points, dni=1.0).irradiance.max() <= LIMIT
+
+
+def test_the_limit_that_a_spread_keeps_bounds_its_light() -> None:
+    """The search for the strongest light ends earlier, at a bound that is farther away."""
+    plant, limit = lay_out("radial", 100), 153.0
+    field = StandbyField(plant, noon_suns(plant.site.latitude_deg))
+    points = field.spread(limit)
+    assert max(light.bound for light in field.rest(points).light) > limit
+    assert all(light.suns < light.bound <= limit for light in field.rest(points, limit).light)
 
 
 def test_no_beam_at_a_spread_point_passes_a_receiver_or_a_target() -> None:

@@ -6,6 +6,7 @@ errors. The difference is subtracted from the limit and the choice is repeated, 
 of the engine's own flux respects the limit.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NoReturn
@@ -228,12 +229,8 @@ def _shaped(scene: Scene, best: SceneAims, demand: Demand, light: dict[str, Any]
     while high > CLOSE * low:
         level = float(np.sqrt(low * high))
         cap = as_float(np.minimum(best.limit, level * wanted))
-        try:
-            trial = _held(scene, best.field, demand, cap, held, None, light)
-        except InputError:
-            low = level
-            continue
-        if trial.engine.powers[0] >= power:
+        trial = _closest(scene, best.field, demand, cap, held, None, light)
+        if trial.excess <= HOLDS and trial.engine.powers[0] >= power:
             held, high = trial, level
         else:
             low = level
@@ -259,6 +256,37 @@ def _held(
     progress: Step | None,
     light: dict[str, Any],
 ) -> SceneAims:
+    """Return the aims of maximum power under a limit.
+
+    Raises
+    ------
+    InputError
+        If no aims respect the limit.
+    """
+    best = _closest(scene, field, demand, limit, start, progress, light)
+    if best.excess > HOLDS:
+        advice = "let heliostats be defocused" if demand.keep else "ask for a lower probability"
+        what = "no aims were found that respect the flux limit"
+
+        def again(raised: FloatArray) -> SceneAims:
+            return _closest(scene, field, demand, raised, None, None, light)
+
+        _refuse(scene, best, demand, again, what, f", or {advice}")
+    if (best.choice.choice < 0).all():
+        return _one_beam(scene, field, demand, limit, light)
+    return best
+
+
+def _closest(
+    scene: Scene,
+    field: Candidates,
+    demand: Demand,
+    limit: FloatArray,
+    start: SceneAims | None,
+    progress: Step | None,
+    light: dict[str, Any],
+) -> SceneAims:
+    """Return the aims of maximum power under a limit, or the aims that exceed it least."""
     aimed_at = (1.0 - BELOW) * limit
     # Difference between the engine's flux quantile and the sum of the images.
     more = np.zeros_like(limit)
@@ -293,12 +321,6 @@ def _held(
             # No cell regains room, so that the rounds come to an end.
             more = more + BEYOND * np.maximum(new - more, 0.0)
     assert best is not None
-    if best.excess > HOLDS:
-        advice = "let heliostats be defocused" if demand.keep else "ask for a lower probability"
-        what = "no aims were found that respect the flux limit"
-        _refuse(scene, best, demand, what, f", or {advice}")
-    if (best.choice.choice < 0).all():
-        return _one_beam(scene, field, demand, limit, light)
     return best
 
 
@@ -420,34 +442,45 @@ def _place(scene: Scene, cell: tuple[int, ...]) -> str:
     return f"row {cell[0]}, column {cell[1]} ({east:.1f}, {north:.1f}, {up:.1f} m)"
 
 
-def _refuse(scene: Scene, trial: SceneAims, demand: Demand, what: str, advice: str) -> NoReturn:
-    """Raise InputError: where the limit is exceeded most, by how much, and what would hold."""
+def _refuse(
+    scene: Scene,
+    trial: SceneAims,
+    demand: Demand,
+    again: Callable[[FloatArray], SceneAims],
+    what: str,
+    advice: str,
+) -> NoReturn:
+    """Raise InputError: where the limit is exceeded most, by how much, and what would hold.
+
+    ``again`` returns the aims under a higher limit. All cells' limits are raised until these aims
+    respect them, as their allowance for errors depends on the room of all cells.
+    """
     over = trial.quantile / trial.limit
     cell = tuple(int(n) for n in np.unravel_index(over.argmax(), over.shape))
-    limit = demand.limit.on(*over.shape)[cell]
-    others = limit - trial.limit[cell]
-    flux = trial.quantile[cell] + others
-    enough = (_raised(trial, demand).limit[cell] + others) / (1.0 - demand.limit.margin)
+    limit = demand.limit.on(*over.shape)
+    others = limit - trial.limit
+    flux, given = trial.quantile[cell] + others[cell], limit[cell] / (1.0 - demand.limit.margin)
+    enough, higher = given, trial
+    for _ in range(RAISES):
+        if higher.excess <= HOLDS:
+            break
+        enough = _upward(given * float(((higher.quantile + others) / limit).max()))
+        higher = again(as_float(enough / given * limit - others))
     hint = f"; {demand.limit.unit_hint}" if demand.limit.unit_hint else ""
+    rest = " and elsewhere by the same factor" if np.ndim(demand.limit.flux) else ""
     raise InputError(
         f"receiver {surface_in(scene).name}: {what}; {_place(scene, cell)} gets "
         f"{1e-3 * flux:.4g} kW/m², of which {1e-3 * trial.risk.above[cell]:.4g} "
-        f"are due to errors, {_percent(flux / limit - 1.0)} above its {1e-3 * limit:.4g}; "
-        f"raise the limit there to {1e-3 * enough:.4g} kW/m²{advice}{hint}"
+        f"are due to errors, {_percent(flux / limit[cell] - 1.0)} above its "
+        f"{1e-3 * limit[cell]:.4g}; raise the limit there to {1e-3 * enough:.4g} kW/m²"
+        f"{rest}{advice}{hint}"
     )
 
 
-def _raised(trial: SceneAims, demand: Demand) -> SceneAims:
-    """Return aims under limits raised until they hold; see `_refuse`.
-
-    The allowance for errors depends on the limits, because it counts the room of all cells.
-    """
-    for _ in range(RAISES):
-        if trial.excess <= HOLDS:
-            break
-        limit = as_float(trial.limit * (1.0 + trial.excess))
-        trial = replace(trial, limit=limit, risk=risk_of(trial.engine, demand, limit))
-    return trial
+def _upward(flux: float) -> float:
+    """Return a flux rounded up to the four digits that are printed."""
+    step = 10.0 ** (np.floor(np.log10(flux)) - 3.0)
+    return float(np.ceil(flux / step) * step)
 
 
 def _percent(excess: float) -> str:
@@ -477,8 +510,12 @@ def _one_beam(
     none = np.zeros(images.shape[::-1])
     power = float(field.power[row, aim])
     choice = Choice(chosen, none, field.flux(chosen), power, np.nan)
-    trial = _evaluated(scene, field, choice, demand, limit, light)
+
+    def under(cap: FloatArray) -> SceneAims:
+        return _evaluated(scene, field, choice, demand, cap, light)
+
+    trial = under(limit)
     if trial.excess > HOLDS:
         what = "the flux limit does not allow even the beam with the lowest peak"
-        _refuse(scene, trial, demand, what, "")
+        _refuse(scene, trial, demand, under, what, "")
     return trial

@@ -11,7 +11,8 @@ def refusal(error: TyperException) -> str | None:
     context = getattr(error, "ctx", None)
     if context is not None and error.message == context.get_help():
         return None
-    text = _number(error) or " ".join(error.format_message().split())
+    said = error.format_message().replace("Value error, ", "").removesuffix(".")
+    text = _number(error) or " ".join(said.split())
     return text if context is None else f"{text}; see {context.command_path} -h"
 
 

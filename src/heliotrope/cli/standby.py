@@ -53,7 +53,7 @@ def standby(
     if limit_suns is not None:
         with progress("spreading standby points", as_json) as step:
             points = field.spread(limit_suns, step)
-        rests["spread"] = field.rest(points)
+        rests["spread"] = field.rest(points, limit_suns)
         if csv is not None:
             from heliotrope.field.points import write_points
 

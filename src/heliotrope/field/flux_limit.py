@@ -121,7 +121,7 @@ def read_limit(path: str | Path, margin: float = 0.0) -> FluxLimit:
         length.
     """
     rows: list[list[float]] = []
-    for number, line in enumerate(read_text(path, "a flux limit").splitlines(), start=1):
+    for number, line in enumerate(read_text(path, "a flux map").splitlines(), start=1):
         # Spreadsheets append commas to short lines.
         cells = [cell.strip() for cell in line.strip().rstrip(",").split(",")]
         if cells == [""]:

@@ -10,7 +10,7 @@ receiver, because the near heliostats have the narrowest and brightest beams.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -136,12 +136,17 @@ class StandbyField:
         self._aims = np.stack(list(aims.values()))
         self._around = float(np.linalg.norm(self._vertex - self.center, axis=-1).max())
 
-    def rest(self, points: FloatArray) -> Rest:
-        """Return the light, the return and the paths of the field at standby points (N, 3)."""
+    def rest(self, points: FloatArray, limit: float = np.inf) -> Rest:
+        """Return the light, the return and the paths of the field at standby points (N, 3).
+
+        ``limit``: largest light with which `spread` found these points, suns. It is an upper bound
+        as well, often closer than that of the strongest light.
+        """
         moves = self._moves(points)
+        lights = [hottest(self._beams(points, s), self.center, self._around) for s in self.suns]
         return Rest(
             points,
-            tuple(hottest(self._beams(points, s), self.center, self._around) for s in self.suns),
+            tuple(replace(light, bound=min(light.bound, limit)) for light in lights),
             moves,
             self._returns(moves),
             tuple(len(self._blocked(self._rows, points, sun)) for sun in self.suns),

@@ -42,6 +42,7 @@ from heliotrope.optics.scene import Scene
 from heliotrope.optics.surfaces import surface_of
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import DNI_READING
+from heliotrope.plant.field.assigned import differ
 from heliotrope.plant.field.state import OUT_OF_ORDER
 from heliotrope.plant.operations.automatic import AutomaticControl
 from heliotrope.plant.operations.flux_check import Beyond, FluxCheck
@@ -302,6 +303,7 @@ class Aiming:
 
     async def _step(self, now: float) -> None:
         """Compute and send aims; after a failure the last good aims stay in force."""
+        self._keep(now)
         if self._automatic.idle:
             await self._stand_still(now)
             return
@@ -516,21 +518,29 @@ class Aiming:
         none, aims = np.full(3, np.nan), self._automatic.aims
         return np.array([aims.get(name, none) for name in self._plant.field.names])
 
+    def _keep(self, now: float) -> None:
+        """Assign beams on the receiver their present aims, to which they return after a visit.
+
+        They have other aims if the program found them there, or if an operator aimed them.
+        """
+        names, aims = self._plant.field.names, self._plant.aims
+        on = self._on(now) & self._movers(now) & differ(aims, self._allotted())
+        self._automatic.aims.update({names[row]: aims[row].copy() for row in np.flatnonzero(on)})
+
     def _round(self, now: float) -> Round:
-        """Return the input of a round; forget records that are no longer relevant."""
+        """Return the input of a round."""
         plant, settings = self._plant, self._settings
         assert settings.limit is not None
-        on, free, allotted = self._on(now), self._movers(now), self._allotted()
+        on, free, aims = self._on(now), self._movers(now), self._allotted()
         if self._heating is not None:
             # A heliostat that cannot come now would keep others from using the ramp.
             free &= on | plant.field.among((states.IDLE,), now)
         visiting = np.isin(plant.field.names, sorted(self._automatic.visiting))
         # A heliostat that waits for its turn joins at the aim that it was assigned.
         waits = free & ~on & plant.field.among((states.IDLE,), now) & (plant.waiting > 0)
-        aims = np.where((on & free)[:, None], plant.aims, allotted)
         comes = visiting | waits | (~on & self._automatic.movable() & (self._blocked_until >= now))
         fixed = np.where((on & ~free)[:, None], plant.aims, np.nan)
-        fixed = np.where(comes[:, None] & np.isfinite(allotted), allotted, fixed)
+        fixed = np.where(comes[:, None] & np.isfinite(aims), aims, fixed)
         free &= ~comes
         spread = np.stack([*plant.default_aims().values()])
         most = max(1, round(settings.moves / 60.0 * min(now - self._round_at, 60.0)))
