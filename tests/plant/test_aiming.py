@@ -328,6 +328,21 @@ def test_while_an_operator_commands_the_flux_is_watched_and_nothing_moves() -> N
     played(scene)
 
 
+def test_aims_are_chosen_as_soon_as_automatic_control_may_move_the_field() -> None:
+    async def scene(made: LivePlant) -> None:
+        await up(made)
+        operations, olga = made.operations, Person("Olga", Role.OPERATOR)
+        token = operations.take_authority(olga).token
+        while not np.isnan(operations.aims().planned):  # until a round has found her in command
+            operations.plant.authority.keep(olga, token)
+            await asyncio.sleep(1.0)
+        operations.release_authority(olga, token)
+        await asyncio.sleep(8.0)
+        assert operations.aims().planned > 0.0
+
+    played(scene, every=60.0)
+
+
 def test_a_late_failure_leaves_the_field_to_the_operator_who_has_just_taken_it() -> None:
     async def scene(made: LivePlant) -> None:
         await up(made)

@@ -288,13 +288,18 @@ class Aiming:
             await self._pause(begun)
 
     async def _pause(self, begun: float) -> None:
-        """Wait until the next round is due, soon if heliostats wait for the ramp in the sun."""
-        clock, due = self._plant.clock, begun + self._settings.every
-        while self._waits_for_ramp and (now := self._plant.now()) < due:
-            if now >= begun + SOON and self._measured_dni(now) > SUNNY * self._clear_sky():
+        """Wait until the next round is due.
+
+        It follows soon once heliostats may be moved again, or if some wait for the ramp in the sun.
+        """
+        due, idle = begun + self._settings.every, self._automatic.idle
+        while (now := self._plant.now()) < due:
+            soon = idle and not self._automatic.idle
+            if not soon and self._waits_for_ramp and now >= begun + SOON:
+                soon = self._measured_dni(now) > SUNNY * self._clear_sky()
+            if soon:
                 return
-            await sleep_until(clock, min(now + 1.0, due))
-        await sleep_until(clock, due)
+            await sleep_until(self._plant.clock, min(now + 1.0, due))
 
     @property
     def _waits_for_ramp(self) -> bool:
