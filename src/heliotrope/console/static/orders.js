@@ -169,7 +169,7 @@ export function bar(box) {
 
 // The holder of the authority, and the button to take it and give it back.
 export function whoCommands(box) {
-  const text = h("span"), button = h("button", { className: "hx-button" });
+  const text = h("span"), button = h("button", { className: "hx-button" }, t("Take command"));
   box.append(text, me.role === "viewer" ? "" : button);
   const take = async () => {
     const head = store.head;
