@@ -210,7 +210,8 @@ def aim_scene(
         power = float(field.power[np.arange(len(chosen)), chosen].sum())
         choice = Choice(chosen, np.zeros((columns, rows)), field.flux(chosen), power, np.nan)
         return _evaluated(scene, field, choice, demand, limit, light)
-    best = _held(scene, field, demand, limit, start, progress, light)
+    best = _closest(scene, field, demand, limit, start, progress, light)
+    best = _held(scene, best, demand, light)
     return best if demand.wanted is None else _shaped(scene, best, demand, light)
 
 
@@ -247,33 +248,26 @@ def deviation(flux: FloatArray, wanted: FloatArray) -> float:
     return float(np.sqrt(np.mean((flux / flux.mean() - wanted / wanted.mean()) ** 2)))
 
 
-def _held(
-    scene: Scene,
-    field: Candidates,
-    demand: Demand,
-    limit: FloatArray,
-    start: SceneAims | None,
-    progress: Step | None,
-    light: dict[str, Any],
-) -> SceneAims:
-    """Return the aims of maximum power under a limit.
+def _held(scene: Scene, best: SceneAims, demand: Demand, light: dict[str, Any]) -> SceneAims:
+    """Return the aims that `_closest` found, which must respect the limit.
+
+    If every mirror is off, only the beam with the lowest peak shines.
 
     Raises
     ------
     InputError
         If no aims respect the limit.
     """
-    best = _closest(scene, field, demand, limit, start, progress, light)
     if best.excess > HOLDS:
         advice = "let heliostats be defocused" if demand.keep else "ask for a lower probability"
         what = "no aims were found that respect the flux limit"
 
         def again(raised: FloatArray) -> SceneAims:
-            return _closest(scene, field, demand, raised, None, None, light)
+            return _closest(scene, best.field, demand, raised, None, None, light)
 
         _refuse(scene, best, demand, again, what, f", or {advice}")
     if (best.choice.choice < 0).all():
-        return _one_beam(scene, field, demand, limit, light)
+        return _one_beam(scene, best.field, demand, best.limit, light)
     return best
 
 
