@@ -30,6 +30,15 @@ from support.pages import NEEDS_BROWSER, entering, orders_counted, said
 
 Ask = Callable[..., httpx.Response]
 TARGET = "left"
+#: The answer to a POST of the command authority is withheld until `release` is called.
+LATE = """() => {
+  const { fetch } = window, released = new Promise((go) => { window.release = go; });
+  window.fetch = async (place, options) => {
+    const answer = await fetch(place, options);
+    if (options?.method === "POST" && place.endsWith("/authority")) await released;
+    return answer;
+  };
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -254,6 +263,7 @@ def test_an_engineer_marks_corners_on_the_page(
     cameras, true = rendered.live.cameras, pixels(rendered)
     before = rendered.call(lambda: cameras.eye(TARGET))
     page = enter("engineer")
+    page.evaluate(LATE)
     page.click("text=Take command")
     page.wait_for_selector("text=You have command")
     page.click(".hx-tabs >> text=Targets")
@@ -285,6 +295,9 @@ def test_an_engineer_marks_corners_on_the_page(
     page.wait_for_selector(".hx-mark .hx-told:has-text('residuals')")
     page.click(".hx-mark button:text-is('Save')")
     page.wait_for_selector(".hx-mark", state="detached")
+    # The answer to Take command comes late; it does not replace a later result.
+    page.evaluate("release()")
+    page.wait_for_timeout(200)
     said(page, "corners marked")
     assert rendered.call(lambda: cameras.eye(TARGET)) is not before
     # Escape leaves everything as it is.

@@ -173,11 +173,12 @@ export function whoCommands(box) {
   box.append(text, me.role === "viewer" ? "" : button);
   const take = async () => {
     const head = store.head;
-    if (store.mine) return act(() => api("DELETE", "authority"), t("authority"));
+    const change = (method, path, body) => act(() => api(method, path, body), t("authority"), false); // the button shows the result
+    if (store.mine) return change("DELETE", "authority");
     const other = head.holder && head.holder !== me.name && head.holder !== AUTOMATIC;
-    if (!other) return act(() => api("POST", "authority"), t("authority"));
+    if (!other) return change("POST", "authority");
     const why = await ask(t("{who} has command. Break it?", { who: head.holder }), [{ name: "reason", label: t("Reason") }], t("Break and take"));
-    return why ? act(() => api("POST", "authority/seize", { reason: why.reason }), t("authority")) : null;
+    return why ? change("POST", "authority/seize", { reason: why.reason }) : null;
   };
   button.addEventListener("click", async () => { await take(); kept = 0; });
   let kept = 0;
