@@ -104,6 +104,24 @@ def test_derivatives_are_those_of_moved_beams(scene: Scene) -> None:
         assert np.abs(shared[:, k].sum(axis=0) - change).max() < 0.03 * np.abs(shared[:, k]).max()
 
 
+def test_loads_are_the_flux_and_the_variance_that_the_engine_finds() -> None:
+    # The cells are much smaller than the only beam.
+    fine = replace(PLATE, shape=(60, 60))
+    given = in_the_middle(replace(field(60, fine), dark=np.arange(60) != 40))
+    own = np.tile(1e-8 * np.eye(2), (60, 1, 1))
+    given = replace(given, mirrors=replace(given.mirrors, pointing=own))
+    engine, rate = FieldFlux(given), 1e-2
+    found = candidates(engine)
+    middle = np.full(60, found.aims.shape[1] // 2)
+    charged = found.charged(given, rate)
+    added = (charged.load(middle) - charged.flux(middle)).T / rate
+    none = np.zeros(added.shape)
+    variance = engine.spread(own, np.zeros((60, 0, 2)), np.zeros(60, dtype=int), none)[0]
+    assert np.array_equal(found.load(middle), found.flux(middle))
+    assert added.sum() == pytest.approx(variance.sum(), rel=0.15)
+    assert np.corrcoef(added.ravel(), variance.ravel())[0, 1] > 0.97
+
+
 def test_the_bound_holds_and_the_choice_is_near_the_optimum_of_an_exact_solver() -> None:
     given = in_the_middle(field(24, PLATE))
     found = candidates(FieldFlux(given))
@@ -409,14 +427,15 @@ def test_maps_are_resampled_to_the_least_and_files_are_read_from_the_top(tmp_pat
 
 
 def test_prices_say_what_a_higher_limit_would_add() -> None:
-    plant, sun = lay_out("radial", 200), [0.1, -0.5, 0.85]
+    plant, sun = lay_out("radial", 600), [0.1, -0.5, 0.85]
     middle = ht.aim(plant, sun=sun, limit=6e7, strategy="middle", cells=(12, 12))
     assert not middle.price.any()
-    low = ht.aim(plant, sun=sun, limit=0.1 * middle.light.peak, cells=(12, 12))
-    more = 0.05 * float((low.limit * low.price).sum())
-    limit = 0.105 * middle.light.peak
-    high = ht.aim(plant, sun=sun, limit=limit, start=low, cells=(12, 12))
-    assert 0.7 * more < high.power - low.power < 1.4 * more
+    low, high = (
+        ht.aim(plant, sun=sun, limit=share * middle.light.peak, cells=(12, 12))
+        for share in (0.1, 0.11)
+    )
+    more = 0.1 * float((low.limit * low.price).sum())
+    assert 0.8 * more < high.power - low.power < 1.25 * more
     assert low.cells.shape == (*low.price.shape, 3)
     assert (np.diff(low.cells[..., 2], axis=0) > 0.0).all()
     np.testing.assert_array_equal(low.binding, low.quantile > 0.99 * low.limit)
@@ -487,6 +506,21 @@ def test_where_errors_take_most_of_the_limit_the_rest_is_used(scene: Scene, peak
     assert -0.05 < got.excess <= 1e-3
     assert got.risk.above.max() > 0.25 * got.limit.max()
     assert (~got.defocused).sum() > 10
+
+
+@pytest.mark.parametrize(("error", "count", "more"), [(2e-3, 50, 1.05), (5e-4, 100, 1.02)])
+def test_aims_prefer_beams_that_take_little_of_the_limit_for_their_errors(
+    scene: Scene, peak: float, error: float, count: int, more: float
+) -> None:
+    """Wide beams from afar; a near mirror's sharp one moves more flux by the same error."""
+    own = np.tile(error**2 * np.eye(2), (300, 1, 1))
+    given = replace(scene, mirrors=replace(scene.mirrors, pointing=own))
+    demand = Demand(FluxLimit(0.1 * peak))
+    got = aim_scene(given, demand)
+    near = np.argsort(np.argsort(-given.mirrors.slant)) >= count
+    far = aim_scene(replace(given, dark=near), replace(demand, keep=True))
+    assert max(got.excess, far.excess) <= 1e-3
+    assert got.engine.powers[0] > more * far.engine.powers[0]
 
 
 def test_cells_with_more_room_ask_for_less_than_cells_that_are_all_at_their_limit(

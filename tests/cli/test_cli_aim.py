@@ -131,7 +131,7 @@ def test_ranges_are_few(numbers: list[int], text: str) -> None:
 
 def test_a_uniform_flux_and_a_ramp_are_told(aim: Any) -> None:
     code, out, err = aim(
-        "--limit=120", "--wanted=uniform", "--give-percent=5", "--ramp=25", "--csv=a.csv"
+        "--limit=120", "--wanted=uniform", "--give-percent=5", "--ramp=21", "--csv=a.csv"
     )
     assert code == 0, err
     assert "differs from the desired flux by" in out

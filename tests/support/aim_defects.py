@@ -59,7 +59,7 @@ def ramp_forgotten(patch: pytest.MonkeyPatch) -> None:
 #: Invariant, name, defect, faults and first seed; each is planted in the world "limit".
 ROWS: tuple[tuple[int, str, Plant, tuple[Fault, ...], int], ...] = (
     (FLUX, "the optimiser is given twice the limit", limit_ignored, (), 3),
-    (FLUX, "beams pass one another above the limit", way_unchecked, (), 5),
-    (FLUX, "the ramp is forgotten", ramp_forgotten, (), 14),
+    (FLUX, "beams pass one another above the limit", way_unchecked, (), 10),
+    (FLUX, "the ramp is forgotten", ramp_forgotten, (), 10),
     (ORIGIN, "beams are sent beside the aims that were chosen", aims_shifted, (), 0),
 )  # fmt: skip

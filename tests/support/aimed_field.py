@@ -19,7 +19,7 @@ PLATE = Plate("plate", MIDDLE, np.array([-1.0, 0.0, 0.0]), UP, 6.0, 6.0, (18, 18
 def field(count: int, surface: Surface = CYLINDER, error: float = 0.0) -> Scene:
     k = np.arange(count) + 0.5
     turn, radius = k * np.pi * (3.0 - np.sqrt(5.0)), np.sqrt(150.0 / np.pi * k + 60.0**2)
-    north = np.abs(np.cos(turn)) if surface is PLATE else np.cos(turn)
+    north = np.abs(np.cos(turn)) if isinstance(surface, Plate) else np.cos(turn)
     place = np.stack([radius * np.sin(turn), radius * north, 0.0 * k], axis=-1)
     mirrors = Mirrors.of(
         place, bisector(SUN, normalize(MIDDLE - place)), (6.0, 5.0), MIDDLE,

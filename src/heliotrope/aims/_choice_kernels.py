@@ -94,7 +94,37 @@ def _add(i, a, sign, images, shifts, flux):
 
 
 @njit(**_SUMS)
-def flux_of(mirrors, choice, images, shifts, flux):
+def charge(values, begin, box, looks, weight, rate, across, up, loads):
+    """Add ``rate`` times the variance of each image to ``loads``.
+
+    ``across`` and ``up`` (H,): displacement of the mirror's beam by its own error, over the size of
+    two cells.
+    """
+    for j in range(len(begin)):
+        i, columns, rows = j // looks, box[j, 1], box[j, 3]
+        for c in range(columns):
+            left = begin[j] + max(c - 1, 0) * rows
+            right = begin[j] + min(c + 1, columns - 1) * rows
+            at = begin[j] + c * rows
+            for r in range(rows):
+                low, high = max(r - 1, 0), min(r + 1, rows - 1)
+                a = across[i] * (values[right + r] - values[left + r])
+                b = up[i] * (values[at + high] - values[at + low])
+                loads[at + r] += rate * weight[i] * (a * a + b * b)
+
+
+@njit(**_SUMS)
+def peaks(images, out):
+    """Compute the greatest load of each mirror, (H,)."""
+    values, begin, box, looks, weight = images
+    for j in range(len(begin)):
+        i = j // looks
+        for k in range(begin[j], begin[j] + box[j, 1] * box[j, 3]):
+            out[i] = max(out[i], weight[i] * values[k])
+
+
+@njit(**_SUMS)
+def sum_of(mirrors, choice, images, shifts, flux):
     """Add the chosen images of some mirrors to the flux (columns, rows)."""
     for i in mirrors:
         if choice[i] >= 0:

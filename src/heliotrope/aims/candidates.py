@@ -1,9 +1,11 @@
 """The candidate aims of each mirror, and its image at each aim."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.aims import _choice_kernels as kernels
 from heliotrope.errors import InputError
@@ -39,6 +41,9 @@ class Candidates:
     ----------
     images
         Images at the K positions, at half height.
+    loads
+        Load that each value of the images puts on its cell, W/m²: the flux, plus the part of the
+        allowance for errors that the mirror's own error takes up.
     weight
         Ratio of each mirror's light to the light in its images, (H,).
     shifts
@@ -52,6 +57,7 @@ class Candidates:
     """
 
     images: Images
+    loads: npt.NDArray[np.float32]
     weight: FloatArray
     shifts: IntArray
     aims: FloatArray
@@ -60,9 +66,16 @@ class Candidates:
 
     @property
     def table(self) -> tuple[Any, ...]:
-        """The images in the form that the kernels expect."""
+        """The loads in the form that the kernels expect."""
         i = self.images
-        return i.values, i.begin, i.box, i.looks, self.weight
+        return self.loads, i.begin, i.box, i.looks, self.weight
+
+    @cached_property
+    def peak(self) -> float:
+        """Median of the greatest load that each mirror puts on a cell, W/m²."""
+        peaks = np.zeros(len(self.weight))
+        kernels.peaks(self.table, peaks)
+        return float(np.median(peaks[peaks > 0.0])) if peaks.any() else 0.0
 
     @property
     def middle_power(self) -> float:
@@ -71,7 +84,7 @@ class Candidates:
         return float(self.power[:, middle].sum())
 
     def worth(self, price: FloatArray) -> FloatArray:
-        """Return the sum over cells of price times flux, for each candidate, (H, K · S).
+        """Return the sum over cells of price times load, for each candidate, (H, K · S).
 
         The prices are (columns, rows).
         """
@@ -84,12 +97,39 @@ class Candidates:
         run_blocks(block, len(self.weight))
         return out
 
-    def flux(self, choice: IntArray, mirrors: IntArray | None = None) -> FloatArray:
-        """Return the flux of chosen candidates (−1: none), W/m², (columns, rows)."""
+    def load(self, choice: IntArray, mirrors: IntArray | None = None) -> FloatArray:
+        """Return the load of chosen candidates (−1: none), W/m², (columns, rows)."""
         chosen = np.arange(len(choice)) if mirrors is None else mirrors
-        flux = np.zeros(self.images.shape[::-1])
-        kernels.flux_of(chosen, choice, self.table, self.shifts, flux)
-        return flux
+        load = np.zeros(self.images.shape[::-1])
+        kernels.sum_of(chosen, choice, self.table, self.shifts, load)
+        return load
+
+    def flux(self, choice: IntArray) -> FloatArray:
+        """Return the flux of chosen candidates (−1: none), W/m², (columns, rows)."""
+        return replace(self, loads=self.images.values).load(choice)
+
+    def charged(self, scene: Scene, rate: float) -> "Candidates":
+        r"""Return the candidates with loads that include the variance of the mirrors' own errors.
+
+        The load is $f + r s^2 |\nabla f|^2$ with the flux f, the rate r and the standard deviation
+        s of the beam's displacement on the receiver.
+
+        Parameters
+        ----------
+        scene
+            Has one receiver; its mirrors' ``pointing`` is the covariance of their own errors.
+        rate
+            Load per variance of the flux, 1/(W/m²).
+        """
+        surface, mirrors = surface_in(scene), scene.mirrors
+        moved = np.sqrt(0.5 * np.trace(mirrors.pointing, axis1=1, axis2=2)) * mirrors.slant
+        # A beam that rises moves further up the receiver than across its own direction.
+        rise = (surface.center - mirrors.center) @ axis_of(surface) / mirrors.slant
+        step, loads = surface.height / surface.shape[0], self.images.values.copy()
+        across = 0.5 * moved * step / self.images.area
+        up = 0.5 * moved / (step * np.sqrt(np.maximum(1.0 - rise**2, 0.01)))
+        kernels.charge(self.images.values, *self.table[1:], rate, across, up, loads)
+        return replace(self, loads=loads)
 
     def relit(self, weight: FloatArray) -> "Candidates":
         """Return the candidates for a different amount of light on each mirror, (H,)."""
@@ -230,7 +270,7 @@ def candidates(engine: FieldFlux) -> Candidates:
     aims = looks[:, :, None, :] + (step * shifts)[:, None, :, None] * axis_of(surface)
     aims = as_float(aims.reshape(len(mirrors), -1, 3))
     empty = np.zeros(aims.shape[:2])
-    built = Candidates(images, np.ones(len(mirrors)), shifts, aims, empty, width)
+    built = Candidates(images, images.values, np.ones(len(mirrors)), shifts, aims, empty, width)
     power = built.worth(np.full((surface.shape[1], rows), images.area))
     if not power.any():
         raise InputError(

@@ -27,11 +27,11 @@ from heliotrope.aims.candidates import Candidates, spans_of
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.optics.shading import IntArray
 
-#: Change of a cell's price, divided by its area, for a flux of twice the limit.
-STEEP = 10.0
-#: Fields with more mirrors than this are first solved for one mirror in SAMPLE, with this many
-#: sweeps.
-LARGE, SAMPLE, COARSE = 2_000, 10, 20
+#: Greatest change of a cell's price, divided by its area, for a flux of twice the limit, and for a
+#: median beam that joins.
+STEEP, STEP = 10.0, 0.05
+#: The prices are first found with one mirror in SAMPLE, but at least FEW, with this many sweeps.
+SAMPLE, FEW, COARSE = 10, 400, 20
 #: Maximum number of sweeps over all mirrors, and the gap at which they end.
 SWEEPS, GAP = 8, 1e-3
 #: Sweeps between two checks of the gap.
@@ -121,13 +121,12 @@ def optimise(
     reached, least = None, float(np.maximum(field.power.max(axis=1), idle).sum())
     if start is None:
         prices, choice = np.zeros_like(cap), np.full(len(everyone), -1)
-        if len(everyone) > LARGE:
-            few = np.sort(rng.permutation(everyone)[::SAMPLE])
-            best = field.power.max(axis=1)
-            small = cap * (best[few].sum() / best.sum())
-            for _ in range(COARSE):
-                prices = _sweep(field, small, prices, choice, rng.permutation(few), idle)
-            choice = bound(field, cap, prices, idle)[1]
+        few = np.sort(rng.permutation(everyone)[: max(FEW, len(everyone) // SAMPLE)])
+        best = field.power.max(axis=1)
+        small = cap * (best[few].sum() / best.sum())
+        for _ in range(COARSE):
+            prices = _sweep(field, small, prices, choice, rng.permutation(few), idle)
+        choice = bound(field, cap, prices, idle)[1]
     else:
         prices, choice = start.prices.copy(), start.choice.copy()
         least = min(least, bound(field, cap, prices, idle)[0])
@@ -151,7 +150,7 @@ def optimise(
 
 def _near(field: Candidates, cap: FloatArray, choice: IntArray, least: float, gap: float) -> bool:
     """Return whether an earlier choice may need no sweep."""
-    flux = field.flux(choice)
+    flux = field.load(choice)
     power = field.power[np.arange(len(choice)), np.maximum(choice, 0)][choice >= 0].sum()
     return bool((flux <= (1.0 + NEAR) * cap).all() and least <= (1.0 + LIKELY * gap) * power)
 
@@ -165,8 +164,10 @@ def _sweep(
     idle: float,
 ) -> FloatArray:
     """Let mirrors choose in the given order, and return the new prices."""
-    flux = field.flux(choice, order)
-    steep = STEEP * field.images.area / cap
+    flux = field.load(choice, order)
+    steep = (
+        min(STEEP, STEP * float(np.median(cap)) / max(field.peak, 1e-300)) * field.images.area / cap
+    )
     base = prices - steep * cap
     now = np.maximum(base + steep * flux, 0.0)
     kernels.sweep(
@@ -185,7 +186,7 @@ def _settled(
     idle: float,
 ) -> Choice:
     """Return a choice that respects the cap."""
-    mine, over = choice.copy(), field.flux(choice) - cap
+    mine, over = choice.copy(), field.load(choice) - cap
     # The mirrors that yield least for their price leave first.
     rows = np.arange(len(mine))
     paid = np.where(mine >= 0, field.power[rows, np.maximum(mine, 0)], 0.0)

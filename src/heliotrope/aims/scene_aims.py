@@ -17,7 +17,7 @@ import numpy.typing as npt
 from heliotrope.aims.candidates import Candidates, candidates, middles, surface_in
 from heliotrope.aims.errors import Risk, SharedErrors, assess, gains
 from heliotrope.aims.gradient import ascend
-from heliotrope.aims.optimiser import GAP, Choice, Step, optimise
+from heliotrope.aims.optimiser import GAP, SWEEPS, Choice, Step, optimise
 from heliotrope.aims.strategies import Strategy, choose
 from heliotrope.errors import InputError
 from heliotrope.field.flux_limit import FluxLimit
@@ -38,6 +38,9 @@ RAISES = 8
 LEAST, HOLDS = 0.02, 1e-3
 #: Sweeps of every choice after the first, and the gap with which a choice from a start ends.
 AGAIN, LATER_GAP = 2, 2e-3
+#: Rounds in which the charge for own errors is adjusted, if their standard deviation is above this
+#: share of the limit anywhere.
+CHARGING, CHARGED = 3, 0.03
 #: A cell binds if its quantile is within this share of the limit.
 BINDS = 0.01
 #: Ratio of two levels of a wanted map between which no further one is tried.
@@ -291,20 +294,25 @@ def _closest(
         light_now = field.flux(start.choice.choice).sum() / max(start.choice.flux.sum(), 1e-300)
         more = light_now * (start.quantile - start.choice.flux.T)
     best: SceneAims | None = None
-    step, before = 1.0, 0.0
+    step, before, sweeps = 1.0, 0.0, SWEEPS if start is None else AGAIN
     for k in range(ROUNDS):
-        cap = np.maximum(aimed_at - more, LEAST * limit)
-        first = choice is None
+        cap = aimed_at - more
+        if choice is not None:
+            # The loads contain a part of that difference.
+            cap += (field.load(choice.choice) - field.flux(choice.choice)).T
         choice = optimise(
-            field, np.ascontiguousarray(cap.T), choice, keep=demand.keep,
-            gap=gap,
-            progress=_part(progress, k), **({} if first else {"sweeps": AGAIN if k < FREE else 0}),
+            field, np.ascontiguousarray(np.maximum(cap, LEAST * limit).T), choice,
+            keep=demand.keep, sweeps=sweeps if k < FREE else 0, gap=gap,
+            progress=_part(progress, k),
         )  # fmt: skip
         trial = _evaluated(scene, field, choice, demand, limit, light)
         if best is None or _rank(trial) > _rank(best):
             best = trial
+        charging = start is None and k < CHARGING and (trial.risk.own > CHARGED * limit).any()
         # Early rounds may leave room, taken for errors of a choice that stood higher.
-        if -BINDS < best.excess <= 0.0 or (k + 1 >= FREE and trial.excess <= 0.0):
+        if not charging and (
+            -BINDS < best.excess <= 0.0 or (k + 1 >= FREE and trial.excess <= 0.0)
+        ):
             break
         new = trial.quantile - choice.flux.T
         if k < FREE:
@@ -314,8 +322,26 @@ def _closest(
         else:
             # No cell regains room, so that the rounds come to an end.
             more = more + BEYOND * np.maximum(new - more, 0.0)
+        sweeps = SWEEPS if charging else AGAIN
+        field = _charged(trial) if charging else field
     assert best is not None
     return best
+
+
+def _charged(trial: SceneAims) -> Candidates:
+    r"""Return the candidates with the loads that count at these aims.
+
+    To first order, a beam that adds $v$ to the variance $σ_c^2$ adds $k v / 2σ_c$ to the allowance.
+    The rate of all cells is the one with which the charges of these aims are right in the mean of
+    the cells, weighted by their price.
+    """
+    field, risk, scene = trial.field, trial.risk, trial.engine.scene
+    chosen, price = trial.choice.choice, trial.choice.prices.T
+    found = (field.charged(scene, 1.0).load(chosen) - field.flux(chosen)).T
+    adds = 0.5 * risk.factor * risk.own**2 / np.maximum(risk.sigma, 1e-300)
+    if not (price * found).any():
+        return field
+    return field.charged(scene, float((price * adds).sum() / (price * found).sum()))
 
 
 def _rank(trial: SceneAims) -> tuple[bool, float]:
