@@ -38,19 +38,19 @@ def test_heliostats_are_calibrated_at_their_time() -> None:
     last = design().names[-1]
 
     async def main(clock: VirtualClock) -> None:
-        entry = TimetableEntry("ten", (last,), "right", ("12:00+02:00",))
+        entry = TimetableEntry("ten", (last,), "right", ("11:05+02:00",))
         plant = LivePlant(design(entry), clock, LiveOptions(threads=0))
         async with plant.running():
             operations = plant.operations
             (row,) = operations.automatic.timetable.rows()
-            assert row.next == START.replace(hour=10).timestamp()
+            assert row.next == START.replace(minute=5).timestamp()
             assert row.text == ""
-            await until(plant, 9, 59)
+            await until(plant, 9, 4)
             assert last not in operations.automatic.view().asked
             assert not said(plant)
-            await until(plant, 10, 1)
+            await until(plant, 9, 6)
             assert said(plant) == ["timetable: requested 1 of 1 heliostats"]
-            begun = START.replace(hour=10).timestamp()
+            begun = START.replace(minute=5).timestamp()
 
             def results() -> list[str]:
                 found = operations.automatic.view().results

@@ -150,9 +150,9 @@ def optimise(
 
 def _near(field: Candidates, cap: FloatArray, choice: IntArray, least: float, gap: float) -> bool:
     """Return whether an earlier choice may need no sweep."""
-    flux = field.load(choice)
+    load = field.load(choice)
     power = field.power[np.arange(len(choice)), np.maximum(choice, 0)][choice >= 0].sum()
-    return bool((flux <= (1.0 + NEAR) * cap).all() and least <= (1.0 + LIKELY * gap) * power)
+    return bool((load <= (1.0 + NEAR) * cap).all() and least <= (1.0 + LIKELY * gap) * power)
 
 
 def _sweep(
@@ -165,9 +165,8 @@ def _sweep(
 ) -> FloatArray:
     """Let mirrors choose in the given order, and return the new prices."""
     flux = field.load(choice, order)
-    steep = (
-        min(STEEP, STEP * float(np.median(cap)) / max(field.peak, 1e-300)) * field.images.area / cap
-    )
+    change = min(STEEP, STEP * float(np.median(cap)) / max(field.peak, 1e-300))
+    steep = change * field.images.area / cap
     base = prices - steep * cap
     now = np.maximum(base + steep * flux, 0.0)
     kernels.sweep(
