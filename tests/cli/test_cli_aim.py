@@ -55,7 +55,13 @@ def test_json_keeps_the_limit_of_a_file(aim: Any) -> None:
     assert limit[-1].max() == 90000.0
     assert (flux <= limit).all()
     assert got["strategies"][0]["excess"] <= 0.0
-    assert len(got["heliostats"]) == 18
+    assert [one["state"] for one in got["heliostats"]] == ["aim"] * 18
+
+
+def test_without_light_the_irradiance_is_named(aim: Any) -> None:
+    code, _, err = aim("--limit=60", "--dni=0")
+    assert code == 2
+    assert err.endswith("the direct normal irradiance is 0 W/m²; use one above 0\n")
 
 
 def test_the_map_has_flux_and_limit_of_each_cell(aim: Any) -> None:

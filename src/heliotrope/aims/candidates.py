@@ -273,8 +273,11 @@ def candidates(engine: FieldFlux) -> Candidates:
     built = Candidates(images, images.values, np.ones(len(mirrors)), shifts, aims, empty, width)
     power = built.worth(np.full((surface.shape[1], rows), images.area))
     if not power.any():
+        advice = "turn the receiver towards the field, or choose another sun position"
+        if scene.dni <= 0.0:
+            advice = f"the direct normal irradiance is {scene.dni:g} W/m²; use one above 0"
         raise InputError(
             f"receiver {surface.name}: none of the {len(mirrors)} mirrors sends light to any of "
-            "its cells; turn the receiver towards the field, or choose another sun position"
+            f"its cells; {advice}"
         )
     return replace(built, power=power)

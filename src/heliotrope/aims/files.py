@@ -21,14 +21,8 @@ def write_aims(path: str | Path, plan: AimPlan, joins: FloatArray | None = None)
     rows = csv.writer(text, lineterminator="\n")
     head = ("heliostat", "east_m", "north_m", "up_m", "state", "power_kw", "calibration_gain_kw")
     rows.writerow(head if joins is None else (*head, "joins_s"))
-    unlit = plan.unlit
     power, gain = 1e-3 * plan.light.heliostat_power, 1e-3 * plan.gain
-    for k, name in enumerate(plan.names):
-        state = "out of reach" if plan.out_of_reach[k] else "aim"
-        state = "reaches no cell" if unlit[k] else state
-        state = "other receiver" if plan.elsewhere[k] else state
-        state = "lost" if plan.lost_mirrors[k] else state
-        state = "defocus" if plan.defocused[k] else state
+    for k, (name, state) in enumerate(zip(plan.names, plan.states, strict=True)):
         aim = ["" if np.isnan(x) else f"{x:.4f}" for x in plan.aim[k]]
         more = () if joins is None else ("" if np.isnan(joins[k]) else f"{joins[k]:.0f}",)
         rows.writerow((name, *aim, state, f"{power[k]:.4f}", f"{gain[k]:.6f}", *more))

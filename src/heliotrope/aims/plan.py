@@ -79,6 +79,21 @@ class AimPlan(Value, Framed):
         return np.asarray(dark & ~self._unable)
 
     @property
+    def states(self) -> list[str]:
+        """What each heliostat does, N words: "aim", or why it does not."""
+        reasons = {
+            "defocus": self.defocused,
+            "lost": self.lost_mirrors,
+            "other receiver": self.elsewhere,
+            "reaches no cell": self.unlit,
+            "out of reach": self.out_of_reach,
+        }
+        return [
+            next((r for r, mask in reasons.items() if mask[k]), "aim")
+            for k in range(len(self.names))
+        ]
+
+    @property
     def power(self) -> float:
         """Expected power, W."""
         return self.light.power

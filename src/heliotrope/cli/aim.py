@@ -277,12 +277,12 @@ def _document(plans: "Mapping[Any, AimPlan]", chosen: "AimPlan") -> dict[str, An
         "heliostats": [
             {
                 "name": name,
+                "state": state,
                 "aim_m": chosen.aim[k],
-                "defocused": bool(chosen.defocused[k]),
                 "power_w": power[k],
                 "calibration_gain_w": chosen.gain[k],
             }
-            for k, name in enumerate(chosen.names)
+            for k, (name, state) in enumerate(zip(chosen.names, chosen.states, strict=True))
         ],
     }
 
