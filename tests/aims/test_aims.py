@@ -24,7 +24,7 @@ from heliotrope.aims.optimiser import bound, optimise
 from heliotrope.aims.scene_aims import deviation
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.field.layouts import lay_out
-from heliotrope.geometry import normalize, reflect
+from heliotrope.geometry import FloatArray, normalize, reflect
 from heliotrope.optics.receiver_flux import FieldFlux
 from heliotrope.optics.scene import Scene
 from heliotrope.optics.surfaces import Surface
@@ -332,38 +332,52 @@ def test_a_start_gives_aims_as_good_with_another_sun_and_without_a_mirror(
     assert again.engine.powers[0] > 0.995 * held.engine.powers[0], "the lost mirrors come back"
 
 
+def kept(aims: SceneAims, error: float, draws: int, modes: FloatArray | None = None) -> float:
+    """Return the share of draws of true errors in which the limit holds.
+
+    ``modes``: see `SharedErrors.modes`; thirty mirrors are a cluster.
+    """
+    given, m, rng = aims.engine.scene, aims.engine.scene.mirrors, np.random.default_rng(1)
+    ray = reflect(np.broadcast_to(SUN, m.normal.shape), m.normal)
+    right = normalize(np.stack([ray[:, 1], -ray[:, 0], 0.0 * ray[:, 0]], axis=-1))
+    up, held = np.cross(right, ray), 0
+    sharp = replace(m, pointing=0.0 * m.pointing)
+    for _ in range(draws):
+        off = error * rng.standard_normal((len(m), 2))
+        if modes is not None:
+            off += np.tensordot(rng.standard_normal(3), modes[:, :3], (0, 1))
+            tilt = rng.standard_normal((len(m) // 30, 2))[np.arange(len(m)) // 30]
+            off += np.einsum("hm,hmk->hk", tilt, modes[:, 3:])
+        normal = normalize(ray + off[:, :1] * right + off[:, 1:] * up + SUN)
+        flux = FieldFlux(replace(given, mirrors=replace(sharp, normal=normal))).maps[0]
+        held += bool((flux <= aims.limit).all())
+    return held / draws
+
+
 def test_the_limit_holds_in_as_many_draws_of_true_errors_as_promised(
     scene: Scene, peak: float
 ) -> None:
     error, shared = 3e-4, SharedErrors(drift=8e-4, cluster=8e-4, clock=2.0)
-    groups = np.arange(300) // 30
-    pole = normalize(np.array([0.0, 0.8, 0.6]))
-    own = replace(
-        scene, mirrors=replace(scene.mirrors, pointing=np.tile(error**2 * np.eye(2), (300, 1, 1)))
-    )
+    groups, pole = np.arange(300) // 30, normalize(np.array([0.0, 0.8, 0.6]))
+    own = np.tile(error**2 * np.eye(2), (300, 1, 1))
+    given = replace(scene, mirrors=replace(scene.mirrors, pointing=own))
     limit = FluxLimit(0.6 * peak)
-    rng = np.random.default_rng(1)
+    modes = shared.modes(given.mirrors, SUN, pole)
+    careful = aim_scene(given, Demand(limit, 0.9, shared, groups, pole))
+    assert kept(careful, error, 60, modes) >= 0.8
+    assert kept(aim_scene(given, Demand(limit, 0.9)), error, 60, modes) < 0.7
 
-    def kept(aims: SceneAims) -> float:
-        m = aims.engine.scene.mirrors
-        modes = shared.modes(m, SUN, pole)
-        ray = reflect(np.broadcast_to(SUN, m.normal.shape), m.normal)
-        right = normalize(np.stack([ray[:, 1], -ray[:, 0], 0.0 * ray[:, 0]], axis=-1))
-        up, true = np.cross(right, ray), 0
-        sharp = replace(m, pointing=0.0 * m.pointing)
-        for _ in range(60):
-            off = error * rng.standard_normal((300, 2))
-            off += np.tensordot(rng.standard_normal(3), modes[:, :3], (0, 1))
-            tilt = rng.standard_normal((10, 2))[groups]
-            off += np.einsum("hm,hmk->hk", tilt, modes[:, 3:])
-            normal = normalize(ray + off[:, :1] * right + off[:, 1:] * up + SUN)
-            moved = replace(aims.engine.scene, mirrors=replace(sharp, normal=normal))
-            true += FieldFlux(moved).maps[0].max() <= 0.6 * peak
-        return true / 60
 
-    demand = Demand(limit, 0.9, shared, groups, pole)
-    assert kept(aim_scene(own, demand)) >= 0.8
-    assert kept(aim_scene(own, Demand(limit, 0.9))) < 0.7
+@pytest.mark.parametrize(("error", "share"), [(1e-3, 0.05), (2e-3, 0.1)])
+def test_the_limit_holds_as_promised_where_own_errors_take_much_of_it(
+    scene: Scene, peak: float, error: float, share: float
+) -> None:
+    """Errors are half as wide as the beams, and beyond the first order."""
+    own = np.tile(error**2 * np.eye(2), (300, 1, 1))
+    given = replace(scene, mirrors=replace(scene.mirrors, pointing=own))
+    got = aim_scene(given, Demand(FluxLimit(share * peak)))
+    assert got.risk.above.max() > 0.25 * got.limit.max()
+    assert kept(got, error, 400) >= 0.98
 
 
 def test_the_clock_s_error_is_that_of_a_sun_that_moved() -> None:

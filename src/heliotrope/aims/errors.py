@@ -150,8 +150,8 @@ def assess(
         W/m², (rows, columns).
     """
     flux = engine.maps[0]
-    pointing = engine.scene.mirrors.pointing
-    own, shared, _ = engine.spread(pointing, modes, groups, np.zeros(flux.shape))
+    scatter = _scatter(engine.scene.mirrors)
+    own, shared, _ = engine.spread(scatter, modes, groups, np.zeros(flux.shape))
     parts = np.concatenate(
         [shared[:, :FIELD_MODES].sum(axis=0), shared[:, FIELD_MODES:].reshape(-1, *flux.shape)]
     )
@@ -191,7 +191,20 @@ def gains(engine: FieldFlux, risk: Risk, prices: FloatArray) -> FloatArray:
     if not worth.any():
         return np.zeros(count)
     groups = np.arange(count) * 64 // count
-    return engine.spread(engine.scene.mirrors.pointing, np.zeros((count, 0, 2)), groups, worth)[2]
+    scatter = _scatter(engine.scene.mirrors)
+    return engine.spread(scatter, np.zeros((count, 0, 2)), groups, worth)[2]
+
+
+def _scatter(mirrors: Mirrors) -> FloatArray:
+    r"""Return covariances of the mirrors' own errors with which the variance is right, (H, 2, 2).
+
+    The flux is that of images which own errors of variance $s^2$ per axis blur from the width w to
+    $\sqrt{w^2 + s^2}$. Summed over the receiver, the first-order variance of such an image is too
+    small by the factor $w^2 / (w^2 + s^2)$ if the image is a Gaussian.
+    """
+    blur = 0.5 * np.trace(mirrors.pointing, axis1=1, axis2=2)
+    blurred = (widths(mirrors) / mirrors.slant) ** 2
+    return as_float(mirrors.pointing * (blurred / (blurred - blur))[:, None, None])
 
 
 def _reach(engine: FieldFlux) -> float:
