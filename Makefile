@@ -4,8 +4,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-# Some tests wait for a clock: one worker more than there are cores.
-JOBS ?= $(shell expr $$(nproc) + 1)
+# Many tests wait for a clock or a page: two workers more than there are cores.
+JOBS ?= $(shell expr $$(nproc) + 2)
 # Of `make soak`: simulated runs of three minutes in drawn worlds.
 RUNS ?= 2000
 # Of `make mutants`.
