@@ -368,6 +368,25 @@ def test_the_limit_holds_in_as_many_draws_of_true_errors_as_promised(
     assert kept(aim_scene(given, Demand(limit, 0.9)), error, 60, modes) < 0.7
 
 
+@pytest.mark.parametrize(
+    "shared", [SharedErrors(drift=8e-4), SharedErrors(cluster=1e-3), SharedErrors(clock=15.0)]
+)
+def test_shared_errors_blur_the_flux_that_is_expected(
+    scene: Scene, peak: float, shared: SharedErrors
+) -> None:
+    groups, pole = np.arange(300) // 30, normalize(np.array([0.0, 0.8, 0.6]))
+    got = aim_scene(scene, Demand(FluxLimit(0.5 * peak), 0.95, shared, groups, pole))
+    given = got.engine.scene
+    modes = shared.modes(given.mirrors, SUN, pole)
+    scatter = np.einsum("hmi,hmj->hij", modes, modes)
+    wide = replace(given, mirrors=replace(given.mirrors, pointing=scatter))
+    blurred = FieldFlux(wide).maps[0]
+    assert np.abs(got.engine.scattered(scatter) - blurred).max() < 1e-9 * peak
+    assert got.risk.shift == pytest.approx(blurred - got.engine.maps[0], abs=1e-9 * peak)
+    assert got.risk.shift[got.binding].mean() < 0.0
+    assert kept(got, 0.0, 300, modes) > 0.92
+
+
 @pytest.mark.parametrize(("error", "share"), [(1e-3, 0.05), (2e-3, 0.1)])
 def test_the_limit_holds_as_promised_where_own_errors_take_much_of_it(
     scene: Scene, peak: float, error: float, share: float

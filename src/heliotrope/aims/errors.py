@@ -108,6 +108,8 @@ class Risk:
 
     Attributes
     ----------
+    shift
+        Change of the expected flux, W/m², (rows, columns), since shared errors blur it.
     sigma
         Standard deviation of each cell's flux, W/m², (rows, columns).
     factor
@@ -117,6 +119,7 @@ class Risk:
         Standard deviation due to the mirrors' own errors alone, W/m², (rows, columns).
     """
 
+    shift: FloatArray
     sigma: FloatArray
     factor: float
     own: FloatArray
@@ -124,7 +127,7 @@ class Risk:
     @property
     def above(self) -> FloatArray:
         """Margin by which the flux may exceed its expectation, W/m², (rows, columns)."""
-        return as_float(self.factor * self.sigma)
+        return as_float(self.shift + self.factor * self.sigma)
 
 
 def assess(
@@ -149,7 +152,8 @@ def assess(
     limit
         W/m², (rows, columns).
     """
-    flux = engine.maps[0]
+    shared_scatter = np.einsum("hmi,hmj->hij", modes, modes)
+    flux = engine.scattered(shared_scatter) if modes.any() else engine.maps[0]
     scatter = _scatter(engine.scene.mirrors)
     own, shared, _ = engine.spread(scatter, modes, groups, np.zeros(flux.shape))
     parts = np.concatenate(
@@ -170,7 +174,7 @@ def assess(
     factor = max(
         float(np.quantile((off / scale - room).max(axis=1), probability) + room.min()), 0.0
     )
-    return Risk(sigma, factor, as_float(np.sqrt(own)))
+    return Risk(as_float(flux - engine.maps[0]), sigma, factor, as_float(np.sqrt(own)))
 
 
 def gains(engine: FieldFlux, risk: Risk, prices: FloatArray) -> FloatArray:

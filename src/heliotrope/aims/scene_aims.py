@@ -423,7 +423,8 @@ def risk_of(engine: FieldFlux, demand: Demand, limit: FloatArray) -> Risk:
     """Return the uncertainty of the flux under a limit (rows, columns)."""
     scene, mirrors = engine.scene, engine.scene.mirrors
     if not (engine.leaving.any() and (mirrors.pointing.any() or demand.shared.any)):
-        return Risk(np.zeros_like(limit), 0.0, np.zeros_like(limit))
+        none = np.zeros_like(limit)
+        return Risk(none, none, 0.0, none)
     groups = np.zeros(len(mirrors), dtype=np.int64) if demand.groups is None else demand.groups
     modes = demand.shared.modes(mirrors, scene.sun, demand.pole)
     return assess(engine, modes, groups, demand.probability, limit)

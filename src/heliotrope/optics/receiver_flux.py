@@ -123,6 +123,11 @@ class Images:
         return out
 
 
+def _edges(count: int) -> list[int]:
+    """Return where the blocks of ``count`` rows begin and end, (_BLOCKS + 1,)."""
+    return [count * k // _BLOCKS for k in range(_BLOCKS + 1)]
+
+
 class FieldFlux:
     """The flux of a scene on its surfaces.
 
@@ -191,16 +196,32 @@ class FieldFlux:
 
     def _cast(self, rows: IntArray, sign: float) -> None:
         """Add (1) or subtract (−1) the images of the mirrors in ``rows``."""
-        edges = [len(rows) * k // _BLOCKS for k in range(_BLOCKS + 1)]
+        edges = _edges(len(rows))
         for plan, flux, power in zip(self._plans, self._flux, self._power, strict=True):
             plan(rows, edges, self._field(), sign, flux, power)
 
-    def _field(self) -> tuple[Any, ...]:
-        """Return the inputs of the kernels: mirrors and light."""
+    def scattered(self, more: FloatArray) -> FloatArray:
+        """Return the flux on the first surface if the beams had larger errors, W/m².
+
+        Parameters
+        ----------
+        more
+            Covariance of the additional error of each beam, right and up as seen from the mirror,
+            rad², (H, 2, 2).
+        """
+        count, flux = len(self._power[0]), np.zeros_like(self._flux[0])
+        field = self._field(self.scene.mirrors.pointing + more)
+        power = np.zeros_like(self._power[0])
+        self._plans[0](np.arange(count), _edges(count), field, 1.0, flux, power)
+        return flux
+
+    def _field(self, pointing: FloatArray | None = None) -> tuple[Any, ...]:
+        """Return the inputs of the kernels: mirrors, perhaps with other errors, and light."""
         mirrors = self.scene.mirrors
+        pointing = mirrors.pointing if pointing is None else pointing
         return (
             self._table, as_input(self.scene.sun), self._light, as_input(mirrors.slope),
-            as_input(mirrors.pointing), self._sums, self._shading.parts, self._figure,
+            as_input(pointing), self._sums, self._shading.parts, self._figure,
             self._moments,
         )  # fmt: skip
 
