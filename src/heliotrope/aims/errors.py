@@ -5,6 +5,8 @@ mirror i's beam and $g_{ic}$ the derivative of its image. If the mirrors' own er
 $Σ_i$, and shared errors $z_m$ (normal, variance 1) displace beam i by $d_{im}$, then
 
 $$σ_c^2 = \sum_i g_{ic}^\mathsf{T} Σ_i g_{ic} + \sum_m (\sum_i g_{ic} · d_{im})^2.$$
+
+All errors blur the expected flux: own errors that of the engine, shared errors by `Risk.shift`.
 """
 
 from dataclasses import dataclass
@@ -126,8 +128,11 @@ class Risk:
 
     @property
     def above(self) -> FloatArray:
-        """Margin by which the flux may exceed its expectation, W/m², (rows, columns)."""
-        return as_float(self.shift + self.factor * self.sigma)
+        """Margin by which the flux may exceed its expectation, W/m², (rows, columns).
+
+        It is at least 0: near a peak, shared errors can only lower the flux, but may be 0.
+        """
+        return as_float(np.maximum(self.shift + self.factor * self.sigma, 0.0))
 
 
 def assess(
@@ -152,8 +157,9 @@ def assess(
     limit
         W/m², (rows, columns).
     """
-    shared_scatter = np.einsum("hmi,hmj->hij", modes, modes)
-    flux = engine.scattered(shared_scatter) if modes.any() else engine.maps[0]
+    flux = engine.maps[0]
+    if modes.any():
+        flux = engine.scattered(as_float(np.einsum("hmi,hmj->hij", modes, modes)))
     scatter = _scatter(engine.scene.mirrors)
     own, shared, _ = engine.spread(scatter, modes, groups, np.zeros(flux.shape))
     parts = np.concatenate(
