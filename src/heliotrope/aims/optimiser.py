@@ -1,7 +1,7 @@
 r"""Aims that maximise power under a flux limit, by Lagrangian decomposition.
 
-With $x_{ia}$ = 1 if mirror i takes candidate a, which has the power $p_{ia}$ and the flux $f_{iac}$
-in cell c:
+With $x_{ia}$ = 1 if mirror i takes candidate a, which has the power $p_{ia}$ and puts the load
+$f_{iac}$ on cell c (flux, and perhaps an allowance for errors):
 
 $$\max \sum p_{ia} x_{ia}, \qquad \sum f_{iac} x_{ia} \le L_c, \qquad \sum_a x_{ia} \le 1.$$
 
@@ -96,7 +96,7 @@ def optimise(
     gap: float = GAP,
     progress: Step | None = None,
 ) -> Choice:
-    """Return the choice with the most power whose flux does not exceed the cap in any cell.
+    """Return the choice with the most power whose load does not exceed the cap in any cell.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def optimise(
     start
         An earlier choice, whose prices and candidates are the starting point.
     keep
-        Whether every mirror must send its light to the receiver; the flux may then exceed the cap.
+        Whether every mirror must send its light to the receiver; the load may then exceed the cap.
     sweeps
         Maximum number of sweeps over all mirrors; if 0, the start is only brought under the cap.
     gap
@@ -164,16 +164,16 @@ def _sweep(
     idle: float,
 ) -> FloatArray:
     """Let mirrors choose in the given order, and return the new prices."""
-    flux = field.load(choice, order)
+    load = field.load(choice, order)
     change = min(STEEP, STEP * float(np.median(cap)) / max(field.peak, 1e-300))
     steep = change * field.images.area / cap
     base = prices - steep * cap
-    now = np.maximum(base + steep * flux, 0.0)
+    now = np.maximum(base + steep * load, 0.0)
     kernels.sweep(
-        order, field.table, field.shifts, field.power, idle, base, steep, choice, flux,
+        order, field.table, field.shifts, field.power, idle, base, steep, choice, load,
         now.astype(np.float32), spans_of(now),
     )  # fmt: skip
-    return as_float(np.maximum(prices + steep * (flux - cap), 0.0))
+    return as_float(np.maximum(prices + steep * (load - cap), 0.0))
 
 
 def _settled(
